@@ -1,5 +1,5 @@
 //! Compiles `proto/` in pure Rust (protox), so that no `protoc` is needed, and lists the built files of the
-//! operator's console for `src/http/console.rs`.
+//! operator's console for `src/http/resources/console.rs`.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -27,7 +27,7 @@ const FILES: [&str; 12] = [
 const BOXED: [&str; 3] =
     ["sightfix.v1.StreamResponse.answer", "sightfix.v1.Sample.fix", "sightfix.v1.Sample.truth"];
 
-/// What `npm run build` in `console/` writes.
+/// The folder that `npm run build` in `console/` writes.
 const CONSOLE: &str = "console/dist";
 
 fn main() -> Result<(), Box<dyn Error>> {

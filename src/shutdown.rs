@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-/// Time for tasks to drop what they do, before they are left behind.
+/// Time for tasks to drop what they do, before the process ends without them.
 const FORCED_TIME: Duration = Duration::from_secs(1);
 
 /// Handed to everything that runs for long. Clones share one state.
@@ -34,7 +34,7 @@ impl Shutdown {
         self.0.draining.cancel();
     }
 
-    /// Whether the drain has started.
+    /// True if the drain has started.
     #[must_use]
     pub fn is_draining(&self) -> bool {
         self.0.draining.is_cancelled()
@@ -65,7 +65,7 @@ impl Shutdown {
             return true;
         }
         self.0.forced.cancel();
-        // A task that ignores even this is left behind: the process ends anyway.
+        // A task that ignores even this is abandoned: the process ends anyway.
         let _ = tokio::time::timeout(forced_time, self.0.tasks.wait()).await;
         false
     }

@@ -1,6 +1,6 @@
 //! TLS of clients: whom they trust, and who they say they are.
 
-// What other systems and settings send reaches this module: nothing in it may end the process.
+// Input of other systems and of settings reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 use std::sync::Arc;

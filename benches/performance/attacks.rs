@@ -1,4 +1,4 @@
-//! What a well-behaved client keeps beside an attack, what a refusal costs, and what an idle connection costs:
+//! Costs of attacks for a well-behaved client, of a refusal, and of an idle connection:
 //! the second part of docs/explanation/reliability.md.
 //!
 //! Attackers and the measured client share the machine with the server, so what attackers cost the processor

@@ -166,7 +166,7 @@ fn new_database(server: &str) -> String {
     format!("{server}/{name}")
 }
 
-/// What psql prints.
+/// The output of psql.
 fn psql(url: &str, statements: &str, input: &str) -> String {
     let mut psql = Command::new("psql");
     psql.args(["-X", "-q", "-A", "-t", "-v", "ON_ERROR_STOP=1", "-d", url]);

@@ -1,4 +1,4 @@
-//! What keys, limits and TLS cost: fusions with them, against the same server without, and against a bare server over
+//! Costs of keys, limits and TLS: fusions with them, against the same server without, and against a bare server over
 //! rustls.
 
 use std::net::SocketAddr;

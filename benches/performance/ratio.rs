@@ -5,7 +5,7 @@ use crate::tables;
 /// Rounds of each side; the median of their ratios counts.
 const ROUNDS: usize = 7;
 
-/// What came of a comparison.
+/// The outcome of a comparison.
 pub(crate) struct Ratio {
     /// Median measure of ours and of the peer.
     pub(crate) ours: f64,

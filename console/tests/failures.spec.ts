@@ -245,8 +245,9 @@ test.describe('a server with keys', () => {
 
     // A viewer may look, and is told what it may not.
     await page.goto(`${server.url}/#/cameras`);
-    await page.getByRole('button', { name: 'New camera' }).first().click();
-    const dialog = page.getByRole('dialog', { name: 'New camera' });
+    await page.getByRole('button', { name: 'Add camera' }).first().click();
+    const dialog = page.getByRole('dialog', { name: 'Add camera' });
+    await dialog.getByRole('button', { name: /^A file/ }).click();
     await dialog.getByLabel('Name').fill('Gate');
     await dialog.getByRole('button', { name: 'Create camera' }).click();
     await expect(dialog.getByRole('alert')).toContainText(/viewer|role/);

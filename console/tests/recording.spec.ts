@@ -68,8 +68,8 @@ test('the code for a phone holds a key for this camera alone', async ({ console:
   await page.goto('about:blank');
   await page.context().request.post(`${server.url}/v1/session`, { data: { key: secret } });
   await page.goto(`${server.url}/#/cameras/gate/data`);
-  await page.getByRole('button', { name: 'Walk with a phone' }).click();
-  const dialog = page.getByRole('dialog', { name: 'Walk with a phone' });
+  await page.getByRole('button', { name: 'Add phone' }).click();
+  const dialog = page.getByRole('dialog', { name: 'Add phone' });
   await expect(dialog.getByRole('img', { name: 'QR code of the phone page' })).toBeVisible();
   await dialog.getByLabel('Receiver').fill('phone-3');
   await dialog.getByRole('button', { name: 'Add a key for one day' }).click();

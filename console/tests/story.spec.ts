@@ -34,8 +34,9 @@ test('the real square: drop, map, train, look, try, live', async ({ console: pag
   const judged = rowsOf([head, ...lines.filter(isLast)].join('\n'));
   expect(learned.length).toBeGreaterThan(5000);
 
-  await page.getByRole('button', { name: 'New camera' }).first().click();
+  await page.getByRole('button', { name: 'Add camera' }).first().click();
   const dialog = page.getByRole('dialog');
+  await dialog.getByRole('button', { name: /^A file/ }).click();
   await dialog.getByLabel('Name').fill('City square');
   await expect(dialog.locator('input[required]')).toHaveValue('city-square');
   await page.getByRole('button', { name: 'Create camera' }).click();

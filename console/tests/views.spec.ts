@@ -21,6 +21,7 @@ const TOWN: [id: string, name: string, zone: string, east_deg: number, north_deg
 
 const VIEWS: [name: string, path: string, ready: (page: Page) => Promise<void>][] = [
   ['overview', '#/cameras', (page) => expect(page.getByText('North gate').first()).toBeVisible()],
+  ['setup', '#/cameras/north-gate/setup', (page) => expect(page.getByText(/Model version \d+ answers|Modellversion \d+ antwortet/)).toBeVisible()],
   ['scene', '#/cameras/north-gate/scene', (page) => expect(page.getByText(/mean [\d.]+ m|Mittel [\d,]+ m/)).toBeVisible()],
   ['live', '#/cameras/north-gate/live', (page) => expect(page.getByRole('button', { name: 'person-1' })).toBeVisible()],
   ['data', '#/cameras/north-gate/data', (page) => expect(page.locator('.notice').first()).toBeVisible()],

@@ -1,5 +1,5 @@
-//! What is fuzzed: one function per kind of input, over the public interface, with what must hold whatever
-//! the input is. The fuzz targets and the seeded test `tests/it/hostile.rs` share them.
+//! Fuzzed functions: one per kind of input, over the public interface, with the properties that hold whatever
+//! the input is. The fuzz targets and the seeded test `tests/it/hostile` share them.
 
 use std::io::Write as _;
 use std::sync::LazyLock;
@@ -30,13 +30,14 @@ pub struct Target {
 }
 
 /// All kinds of input.
-pub const TARGETS: [Target; 11] = [
+pub const TARGETS: [Target; 12] = [
     Target { name: "csv", run: csv, seeds: || texts(&[CSV]) },
     Target { name: "ndjson", run: ndjson, seeds: || texts(&[SAMPLE_JSON]) },
     Target { name: "json", run: json, seeds: || texts(&[SAMPLE_JSON, OBSERVATION_JSON]) },
     Target { name: "nmea", run: |input| fixes(input, FixFormat::Nmea), seeds: || texts(&[NMEA]) },
     Target { name: "gpx", run: |input| fixes(input, FixFormat::Gpx), seeds: || texts(&[GPX]) },
     Target { name: "gpsd", run: |input| fixes(input, FixFormat::Gpsd), seeds: || texts(&[GPSD]) },
+    Target { name: "rtklib", run: |input| fixes(input, FixFormat::Rtklib), seeds: || texts(&[RTKLIB]) },
     Target { name: "protobuf", run: protobuf, seeds: protobuf_seeds },
     Target { name: "model", run: model, seeds: || vec![DEMO_MODEL.to_vec()] },
     Target { name: "cursor", run: cursor, seeds: || texts(&["Y2FtZXJhczpj", "bW9kZWxzOjc"]) },
@@ -59,6 +60,8 @@ const GPX: &str = "<?xml version=\"1.0\"?><gpx version=\"1.1\"><trk><trkseg>\
     </trkseg></trk><wpt lat=\"-90\" lon=\"180\"/></gpx>";
 const GPSD: &str = "{\"class\":\"TPV\",\"device\":\"/dev/ttyACM0\",\"mode\":3,\
     \"time\":\"2026-01-01T00:00:00.000Z\",\"lat\":59.4371,\"lon\":24.7453,\"epx\":1.5,\"epy\":2.5}\n";
+const RTKLIB: &str = "%  GPST  latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m)\n\
+    2026/09/18 16:47:34.000 23.837350600 90.262550200 -36.2680 1 12 0.0034 0.0029\n2436 492454.5 23.8 90.2 0 5 7 1 1\n";
 const SETTINGS: &str = "data = \"data\"\nlisten = \"127.0.0.1:8080\"\nallowed_hosts = [\"a.example\"]\n\
     [training]\nworkers = 1\n[limits]\nbody_bytes = 1048576\nclient_share = 0.5\n";
 const DEMO_MODEL: &[u8] = include_bytes!("../../models/demo-square.safetensors");

@@ -23,16 +23,8 @@ CREATE TABLE sites (
 CREATE TABLE cameras (
     key                INTEGER PRIMARY KEY AUTOINCREMENT,
     id                 TEXT    NOT NULL UNIQUE,
-    display_name       TEXT    NOT NULL,
-    image_width_px     INTEGER,
-    image_height_px    INTEGER,
-    gnss_sigma_m       REAL,
-    gnss_bias_sigma_m  REAL,
-    recipe             TEXT    NOT NULL,
-    target_classes     TEXT    NOT NULL,
-    labels             TEXT    NOT NULL,
-    receivers          TEXT    NOT NULL,
-    retrain_when_moved INTEGER NOT NULL,
+    -- Of a profile, what no statement asks for, as JSON.
+    profile            TEXT    NOT NULL,
     learn_automatically INTEGER NOT NULL,
     revision           INTEGER NOT NULL,
     created_at_us      INTEGER NOT NULL,
@@ -40,7 +32,6 @@ CREATE TABLE cameras (
     active_model       INTEGER,
     last_model_number  INTEGER NOT NULL DEFAULT 0,
     site_key           INTEGER REFERENCES sites (key),
-    CHECK ((image_width_px IS NULL) = (image_height_px IS NULL)),
     FOREIGN KEY (key, active_model) REFERENCES models (camera_key, number)
 ) STRICT;
 CREATE INDEX cameras_of_site ON cameras (site_key, id) WHERE site_key IS NOT NULL;

@@ -38,7 +38,7 @@ impl TokenBucket {
 
 /// Requests per second of each client. Unlike a [`Quota`] it does not depend on how long they take.
 pub struct RateLimit {
-    /// What is counted, in the plural, for the refusal.
+    /// The name of the counted unit, in the plural, for the refusal.
     what: &'static str,
     per_s: u32,
     buckets: Mutex<HashMap<ClientId, TokenBucket>>,
@@ -50,7 +50,7 @@ const MOST_BUCKETS: usize = 4_096;
 const REFILL_TIME: Duration = Duration::from_secs(1);
 
 impl RateLimit {
-    /// A limit of so many; 0 is no limit.
+    /// A limit of `per_s` units per second; 0 is no limit.
     #[must_use]
     pub fn new(what: &'static str, per_s: u32) -> Self {
         Self { what, per_s, buckets: Mutex::default() }
@@ -78,7 +78,7 @@ impl RateLimit {
     }
 }
 
-/// What bodies cost that are refused for what they contain: they are read and parsed in vain. Each client has some for
+/// The cost of bodies that are refused for their content: they are read and parsed in vain. Each client has some for
 /// free; beyond, it waits before its next body is read.
 pub struct RefusedBodies {
     bytes_per_s: f64,
@@ -98,13 +98,13 @@ impl Debt {
     }
 }
 
-/// What is free, in seconds of the rate: a wrong file or two.
+/// The free amount, in seconds of the rate: a wrong file or two.
 const FREE_S: f64 = 16.0;
 /// Longest wait, s.
 const MAX_WAIT_S: f64 = 10.0;
 
 impl RefusedBodies {
-    /// Forgives so many bytes per second; 0 charges nothing.
+    /// Forgives `bytes_per_s` bytes per second; 0 charges nothing.
     #[must_use]
     pub fn new(bytes_per_s: u32) -> Self {
         Self { bytes_per_s: f64::from(bytes_per_s), debts: Mutex::default() }

@@ -1,4 +1,4 @@
-//! What an operator wants to know of every camera at a glance.
+//! The status of every camera at a glance, for an operator.
 
 use std::sync::Arc;
 
@@ -9,18 +9,17 @@ use crate::domain::{Camera, CameraId, JobState, Result, RunId};
 
 /// A camera with its latest run, its model and what happens in its view.
 pub struct CameraStatus {
-    /// Its profile.
     pub camera: Camera,
     /// Its latest training run, and that run's state.
     pub latest_run: Option<(RunId, JobState)>,
     /// The active model's summary; `None` without a usable model.
     pub model_summary: Option<Arc<ModelSummary>>,
-    /// What happens in its view.
+    /// The activity in its view.
     pub activity: CameraActivity,
 }
 
 impl App {
-    /// What happens in the view of a stored camera, and its model; without its latest run.
+    /// The activity in the view of a stored camera, and its model; without its latest run.
     ///
     /// # Errors
     /// `CameraNotFound`.

@@ -39,7 +39,7 @@ impl App {
         Ok(page_of(cameras, limit, |camera| camera.id().clone()))
     }
 
-    /// What is lost by what the profile leaves out, and whether the active model fits it.
+    /// Warnings about fields that the profile leaves out, and about an active model that does not fit the profile.
     #[must_use]
     pub fn camera_warnings(&self, camera: &Camera) -> Vec<String> {
         let mut warnings = camera.profile.warnings();

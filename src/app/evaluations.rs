@@ -27,7 +27,7 @@ pub struct EvaluationRequest {
     /// The last share of all samples by time is the test, if there are no ranges;
     /// [`DEFAULT_TEST_SHARE`] if `None`.
     pub test_share: Option<f64>,
-    /// What the test samples state, if `None`.
+    /// If `None`, the truth that the test samples state.
     pub truth: Option<Truth>,
     /// The receiver, the filters and the profile's recipe, if `None`.
     pub methods: Option<Vec<Method>>,

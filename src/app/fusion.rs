@@ -15,7 +15,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`; `NoModel` if there is a box and no active model; `TooLarge` beyond the
     /// limit of observations.
-    pub async fn fuse(
+    pub async fn fuse_batch(
         &self,
         camera: Arc<ActiveCamera>,
         observations: &[Observation],
@@ -40,7 +40,7 @@ impl App {
         let fused = observed
             .iter()
             .map(|(observation, observed)| {
-                fuse_observed(&camera, observation, observed).ok_or_else(|| no_model(&camera))
+                fuse_for_camera(&camera, observation, observed).ok_or_else(|| no_model(&camera))
             })
             .collect::<Result<Vec<_>>>()?;
         self.metrics.fused(&fused);
@@ -67,7 +67,7 @@ impl App {
         Ok(())
     }
 
-    /// What answers for a camera; looks into the store for one that another process has made.
+    /// The active camera of an id; looks into the store for one that another process has made.
     ///
     /// # Errors
     /// `PermissionDenied` if the caller is a device of other cameras; `CameraNotFound`; a fault of the store.
@@ -82,7 +82,7 @@ impl App {
 
 /// The position of one observation; `None` for a box while the camera has no model. Where the active model
 /// cannot be used, a box beside a fix is left out, and the fix passes through.
-pub(super) fn fuse_observed(
+pub(super) fn fuse_for_camera(
     camera: &ActiveCamera,
     observation: &Observation,
     observed: &ObservedPositions<'_>,

@@ -5,7 +5,7 @@ use crate::domain::{IdempotentRequest, Result};
 use crate::store::{IdempotencyRecord, StoredAnswer};
 
 impl App {
-    /// What is stored under the key of a request, if it was used before.
+    /// The answer that is stored under the key of a request, if it was used before.
     pub(super) async fn stored_answer(&self, request: &IdempotentRequest) -> Result<Option<StoredAnswer>> {
         self.store.stored_answer(&request.key, self.clock.now()).await
     }

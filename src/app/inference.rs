@@ -87,7 +87,9 @@ impl App {
     ) -> Result<(Arc<ActiveCamera>, u32)> {
         let camera = self.active_camera(id).await?;
         let Some((_, active)) = camera.model() else {
-            let message = format!("camera {id} has no model that answers; train it, or mend its active one");
+            let message = format!(
+                "camera {id} has no model that answers; train it, or activate a version that can be used"
+            );
             return Err(Error::refused(ErrorKind::NoModel, message));
         };
         match version {

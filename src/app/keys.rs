@@ -183,7 +183,7 @@ mod tests {
         App::new(store, clock, randomness, Limits::default(), Metrics::new()).await.expect("an application")
     }
 
-    /// Of two nodes that start at once with one admin key, the second has looked for keys before the first stored it.
+    /// If two nodes start at once with one admin key, the second has looked for keys before the first stored it.
     #[tokio::test]
     async fn an_admin_key_that_another_process_has_stored_closes_access_here_too() {
         let folder = tempfile::tempdir().expect("a folder");

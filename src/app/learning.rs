@@ -29,7 +29,7 @@ pub enum LearningState {
     Learned,
 }
 
-/// What a camera has recorded to learn from, and what is missing.
+/// The recording that a camera learns from, and what is missing in it.
 #[derive(Debug, Clone)]
 pub struct Learning {
     /// How far it has come.
@@ -53,7 +53,7 @@ pub struct Learning {
 }
 
 impl App {
-    /// What a camera has recorded to learn from, and what is missing.
+    /// The recording that a camera learns from, and what is missing in it.
     ///
     /// # Errors
     /// `CameraNotFound`, `CameraOnOtherNode`, `CameraBetweenNodes`.
@@ -175,7 +175,7 @@ impl App {
 }
 
 impl ActiveCamera {
-    /// Whether it records what comes unpaired.
+    /// True if the camera records unpaired boxes and fixes.
     #[must_use]
     pub const fn is_learning(&self) -> bool {
         self.learn_automatically && self.model.is_none() && self.model_fault.is_none()
@@ -209,7 +209,7 @@ fn described(
     (LearningState::Recording, missing(camera, progress, run))
 }
 
-/// What a camera that records is waiting for.
+/// The next requirement of a camera that records.
 fn missing(
     camera: &ActiveCamera,
     progress: &LearningProgress,

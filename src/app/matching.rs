@@ -27,7 +27,7 @@ impl From<&Limits> for MatchLimits {
     }
 }
 
-/// What a recording is matched by.
+/// The camera, the recording and the options of a match.
 #[derive(Debug, Clone, Copy)]
 pub struct MatchRequest<'a> {
     /// The camera's model; `None` to find one.
@@ -51,17 +51,17 @@ pub struct MatchedRecording {
     pub receivers: Receivers,
     /// How each sure box was matched, by time and receiver.
     pub associations: Associations,
-    /// What was matched.
+    /// The report of the match.
     pub report: MatchReport,
 }
 
 /// How boxes were matched, by time and target.
 pub type Associations = BTreeMap<(Timestamp, TargetId), Association>;
 
-/// What became of tracklets and receivers.
+/// The outcome of a match for its tracklets and receivers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MatchReport {
-    /// Tracklets: stretches of boxes of one tracker's id.
+    /// Tracklets: segments of boxes of one tracker's id.
     pub tracklets: usize,
     /// Receivers with fixes.
     pub receivers: usize,
@@ -77,24 +77,22 @@ pub struct MatchReport {
     pub pairs: Vec<MatchedPair>,
     /// Clock offsets found, beside those given.
     pub clock_offsets: Vec<(ReceiverId, ClockOffset)>,
-    /// What the search of a camera without a model found.
+    /// The scores of the search of a camera without a model.
     pub world: Option<WorldScores>,
 }
 
 /// A tracklet, or a part of it, with its receiver.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MatchedPair {
-    /// The receiver.
     pub receiver_id: ReceiverId,
     /// Id that the tracker gave the boxes.
     pub tracker_id: TargetId,
     /// First and last box.
     pub from: Timestamp,
-    /// Last box.
+    /// The time of the last box.
     pub to: Timestamp,
     /// Number of boxes.
     pub detections: u64,
-    /// Posterior probability.
     pub probability: f64,
 }
 

@@ -1,8 +1,8 @@
 //! The use cases, without a transport: both REST and gRPC call these and nothing below them.
 //!
-//! Never here: SQL, status codes, wire formats, reading the wall clock.
+//! Does not contain SQL, status codes or wire formats, and does not read the wall clock.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 pub mod access;
@@ -60,7 +60,7 @@ pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
     LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SinkFeed, SinkFeeds,
     SinkPosition, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent, TargetUpdate,
-    TrackPoint, WantedPositions, WorldSighting, WorldTrackPoint,
+    TrackPoint, UnplacedBox, WantedPositions, WorldSighting, WorldTrackPoint,
 };
 pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
 pub use models::GnssErrorEstimate;
@@ -83,16 +83,16 @@ pub struct App {
     caller: Caller,
 }
 
-/// What an [`App`] is made of.
+/// The parts from which an [`App`] is made.
 pub struct Parts {
     opened_store: Store,
     /// Profiles and active models, ready to answer.
     pub registry: Registry,
     /// Sites, ready to track.
     pub site_registry: SiteRegistry,
-    /// What connections with other systems do.
+    /// The status of connections with other systems.
     pub connection_board: ConnectionBoard,
-    /// What waits for the outboxes of their sinks.
+    /// Positions that wait for the outboxes of their sinks.
     pub sink_feeds: SinkFeeds,
     /// Where their sinks write files, if they may: set by the server at its start.
     pub export_folder: OnceLock<PathBuf>,
@@ -100,14 +100,13 @@ pub struct Parts {
     pub serial_devices: OnceLock<Vec<PathBuf>>,
     /// Keys and sessions, ready to answer.
     pub access: Access,
-    /// What time it is.
     pub clock: Clock,
     /// Ids and seeds.
     pub randomness: Randomness,
-    /// What an outside client may make large.
+    /// The limits of everything that an outside client can make large.
     pub limits: Limits,
     /// How much of each bounded resource clients may hold at a time.
-    pub quotas: Quotas,
+    pub quotas: Arc<Quotas>,
     /// Counters and times.
     pub metrics: Metrics,
     /// Places for recordings that are paired in memory.
@@ -155,7 +154,7 @@ impl App {
         access.refresh(&store, &clock).await?;
         let pairings = Arc::new(Semaphore::new(limits.pairings));
         let (residuals, waiting) = live::residual_queue();
-        let quotas = Quotas::new(&limits);
+        let quotas = Arc::new(Quotas::new(&limits));
         let parts = Parts {
             opened_store: store,
             registry,

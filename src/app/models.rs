@@ -133,7 +133,7 @@ impl PlaneMoments {
     }
 }
 
-/// Whether a receiver moved, by the mean positions of successive intervals. The noise of fixes averages out over an
+/// The movement of a receiver, by the mean positions of successive intervals. The noise of fixes averages out over an
 /// interval, and the slow error of a receiver that stands drifts by far less than somebody walks.
 #[derive(Default)]
 struct Movement {
@@ -178,7 +178,7 @@ impl Movement {
         self.previous = Some((began_at, [east_m, north_m]));
     }
 
-    /// Whether most steps between intervals were fast.
+    /// True if most steps between intervals were fast.
     const fn is_walking(&self) -> bool {
         self.fast_steps > self.slow_steps
     }

@@ -22,11 +22,9 @@ use crate::model::Regressor;
 pub struct PairedImport<D, F> {
     /// Rows of boxes.
     pub detections: D,
-    /// Their format.
     pub detections_format: Format,
     /// Rows of fixes.
     pub fixes: F,
-    /// Their format.
     pub fixes_format: FixFormat,
     /// How a box finds its fix.
     pub settings: PairingSettings,
@@ -34,24 +32,24 @@ pub struct PairedImport<D, F> {
     pub target_id: Option<TargetId>,
     /// The receiver of fixes that name none.
     pub receiver_id: Option<ReceiverId>,
-    /// Whether boxes that find no fix are stored as samples without one.
+    /// True if boxes that find no fix are stored as samples without one.
     pub keeps_unpaired: bool,
     /// How the samples are stored.
     pub options: ImportOptions,
     /// How CSV files are laid out.
     pub layout: CsvLayout,
-    /// Whether the clock offsets are estimated, too. They are reported, never applied.
+    /// True if the clock offsets are estimated, too. They are reported, never applied.
     pub estimates_offsets: bool,
     /// How boxes are matched with receivers first; `None` where their targets have the same ids.
     pub matching: Option<MatchSettings>,
 }
 
-/// What became of two files.
+/// The report of an import of two files.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PairedReport {
-    /// What became of the samples.
+    /// The counts of samples.
     pub samples: ImportReport,
-    /// What became of the rows.
+    /// The counts of rows.
     pub counts: PairingCounts,
     /// Rows that are none.
     pub rejected: RejectedParts,
@@ -59,11 +57,11 @@ pub struct PairedReport {
     pub unnamed_fixes_of: Option<Receiver>,
     /// Clock offsets by receiver, if they were asked for; `None` where the files do not show them.
     pub clock_offsets: Vec<(Receiver, Option<OffsetEstimate>)>,
-    /// What was matched, if that was asked for.
+    /// The report of the match, if one was requested.
     pub matching: Option<MatchReport>,
 }
 
-/// What the camera says about its fixes and boxes.
+/// The camera's settings for fixes and boxes.
 struct CameraContext {
     receivers: Receivers,
     regressor: Option<Arc<Regressor>>,
@@ -73,7 +71,7 @@ struct CameraContext {
 /// The same files are matched in the same way whenever they are sent.
 const MATCH_SEED: u64 = 1;
 
-/// What was paired, before it is stored.
+/// Paired rows before they are stored.
 struct Work {
     samples: Vec<StoredSample>,
     report: PairedReport,

@@ -1,6 +1,6 @@
 //! Recorded detections and fixes that come apart, made into samples.
 //!
-//! Never here: files opened, pairing rules (they are [`crate::fusion::pairing`]'s).
+//! Does not open files, and does not contain pairing rules (they are [`crate::fusion::pairing`]'s).
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -16,9 +16,7 @@ use crate::fusion::pairing::{Paired, PairingSettings, pair};
 /// Which of the two files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Part {
-    /// The boxes.
     Detections,
-    /// The fixes.
     Fixes,
 }
 
@@ -36,20 +34,19 @@ impl Part {
 /// Rows of both files that are none.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RejectedParts {
-    /// Their number.
     pub count: u64,
     /// The first of each file, with their reasons.
     pub rows: Vec<(Part, RowError)>,
 }
 
-/// What was read of two files, in memory.
+/// The rows of two files, in memory.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Recording {
     /// The boxes, in the file's order.
     pub detections: Vec<Detection>,
     /// The fixes, in the file's order.
     pub fixes: Vec<ReceivedFix>,
-    /// What could not be read.
+    /// The rows that could not be read.
     pub rejected: RejectedParts,
 }
 
@@ -215,14 +212,14 @@ pub fn of_part(part: Part, error: Error) -> Error {
     }
 }
 
-/// What became of the rows of two files; a row that was rejected counts nowhere here.
+/// Counts of the rows of two files. Rejected rows are not counted here.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct PairingCounts {
-    /// Boxes read.
+    /// Number of boxes read.
     pub detections: u64,
-    /// Fixes read.
+    /// Number of fixes read.
     pub fixes: u64,
-    /// Samples made.
+    /// Number of samples made.
     pub paired: u64,
     /// Boxes of targets that no fix belongs to.
     pub detections_without_fixes: u64,

@@ -44,17 +44,17 @@ pub struct ActiveCamera {
     pub e_gnss_m2: Option<f64>,
     /// Which target carries which receiver, for pairing.
     pub receivers: Receivers,
-    /// Whether to train again by itself after the camera was moved.
+    /// True if the camera is trained again automatically after it was moved.
     pub retrain_when_moved: bool,
-    /// Whether to learn automatically while there is no model.
+    /// True if the camera learns automatically while there is no model.
     pub learn_automatically: bool,
     /// The site whose tracks the camera contributes to.
     pub site: Option<SiteId>,
-    /// What the drift detector found with that model.
+    /// The movement that the drift detector found with that model.
     pub moved: Option<Arc<CameraMoved>>,
     /// The active model and its version number.
     pub model: Option<(Arc<Regressor>, u32)>,
-    /// What an operator wants to know of that model.
+    /// The summary of that model for an operator.
     pub model_summary: Option<Arc<ModelSummary>>,
     /// Why the active model cannot be used; then `model` is `None`.
     pub model_fault: Option<ModelFault>,
@@ -74,7 +74,6 @@ pub struct ModelSummary {
 /// An active model version that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ModelFault {
-    /// The version.
     pub version: u32,
     /// A sentence for the operator.
     pub reason: String,
@@ -87,7 +86,7 @@ impl ActiveCamera {
         self.model.as_ref().map(|(regressor, version)| (&**regressor, *version))
     }
 
-    /// What rows of the camera must satisfy.
+    /// The rules for rows of the camera.
     #[must_use]
     pub fn row_rules(&self, now: Timestamp) -> RowRules {
         RowRules { time_bounds: TimeBounds::at(now), image_size: self.image_size }
@@ -109,7 +108,7 @@ pub struct Registry {
     cameras: ArcSwap<HashMap<CameraId, Arc<ActiveCamera>>>,
     /// Held from reading the store to replacing the map, so that no change undoes a later one.
     change: Mutex<Refreshed>,
-    /// What is known may be of a history that the database has not; it is read again, whatever version it has.
+    /// True if the known cameras may be of a history that the database has not; they are read again, whatever version.
     is_distrusted: AtomicBool,
     /// Tells this run of the server apart from others.
     run_id: u64,
@@ -127,7 +126,7 @@ impl Registry {
         self.run_id.wrapping_add(key.0.cast_unsigned())
     }
 
-    /// What answers for a camera.
+    /// Returns the active camera of an id.
     #[must_use]
     pub fn get(&self, id: &CameraId) -> Option<Arc<ActiveCamera>> {
         self.cameras.load().get(id).cloned()
@@ -363,7 +362,7 @@ impl Registry {
         }))
     }
 
-    /// What to say of a model that cannot be loaded; logged when it is found, not with every refresh.
+    /// The fault of a model that cannot be loaded; logged when it is found, not with every refresh.
     ///
     /// # Errors
     /// A refusal that says nothing of the model: the camera was deleted, the store is overloaded or closed.

@@ -16,10 +16,10 @@ use crate::store::Store;
 /// never empties the store.
 const BELIEVED: SignedDuration = SignedDuration::from_hours(7 * 24);
 
-/// What the deletion of old samples came to.
+/// The outcome of the deletion of old samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Retention {
-    /// So many samples were deleted.
+    /// Number of samples that were deleted.
     Deleted(u64),
     /// None was, for the clock is not believed.
     Refused(ClockDoubt),
@@ -33,7 +33,7 @@ pub struct ClockDoubt {
 }
 
 impl ClockDoubt {
-    /// What a clock shows beside the newest sample, for samples that may be so old; `None` if it is believed.
+    /// Returns the doubt if the clock is far from the newest sample, for samples up to `age` old; `None` otherwise.
     fn of(now: Timestamp, newest_sample: Timestamp, age: SignedDuration) -> Option<Self> {
         let is_far = now.duration_since(newest_sample).abs() > BELIEVED.min(age);
         is_far.then_some(Self { now, newest_sample })

@@ -27,28 +27,28 @@ const BATCHES_AHEAD: usize = 8;
 pub struct ImportOptions {
     /// When they are acknowledged.
     pub durability: Durability,
-    /// What becomes of samples that are stored already.
+    /// The rule for samples that are stored already.
     pub on_conflict: OnConflict,
     /// Given if the client may send the same import again.
     pub idempotent: Option<IdempotentRequest>,
 }
 
-/// What became of an import's rows.
+/// The counts of an import's rows.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ImportReport {
-    /// Stored now.
+    /// Number of samples stored now.
     pub accepted: u64,
-    /// Of the accepted ones, those without a fix.
+    /// Number of accepted samples without a fix.
     pub without_fix: u64,
     /// The same camera, target and time were stored before, or stand twice in the import.
     pub duplicate: u64,
-    /// Of the accepted ones, those that replaced a stored sample on request.
+    /// Number of accepted samples that replaced a stored sample on request.
     pub replaced: u64,
     /// Not stored for a fault of their own.
     pub rejected: u64,
     /// The first of them, with their reasons.
     pub rejected_rows: Vec<RejectedRow>,
-    /// What seems to be wrong with the rows as a whole, with its remedy.
+    /// Probable faults of the rows as a whole, each with its remedy.
     #[serde(default)]
     pub warnings: Vec<String>,
 }
@@ -108,7 +108,7 @@ impl App {
         let reading =
             tokio::task::spawn_blocking(move || read_batches(file, format, &layout, &rules, &sender));
         while let Some(mut batch) = batches.recv().await {
-            // What was read while the last batch was stored goes into one transaction.
+            // Rows that were read while the last batch was stored go into one transaction.
             while let Ok(more) = batches.try_recv() {
                 batch.extend(more);
             }
@@ -134,7 +134,7 @@ impl App {
         if let Some(request) = &options.idempotent
             && self.stored_answer(request).await?.is_some()
         {
-            // What is asked for is known once all of it has come.
+            // The request is known once all of it has come.
             while let Some(chunk) = batches.next().await {
                 chunk.into_iter().try_for_each(|row| row.map(drop))?;
             }
@@ -163,7 +163,7 @@ impl App {
         import.finish(end).await
     }
 
-    /// What became of an import that was made under the same key before, if any.
+    /// The report of an import that was made under the same key before, if any.
     ///
     /// # Errors
     /// `IdempotencyKeyReused` if that was another one.
@@ -173,7 +173,7 @@ impl App {
         first.map(|report| serde_json::from_str(&report).map_err(Error::fault)).transpose()
     }
 
-    /// What the rows of a camera must keep.
+    /// The rules for rows of a camera.
     ///
     /// # Errors
     /// `CameraNotFound`.
@@ -196,7 +196,7 @@ impl App {
         Ok(page_of(samples, limit, SampleKey::of))
     }
 
-    /// How many samples there are.
+    /// Number of samples.
     ///
     /// # Errors
     /// `CameraNotFound`.
@@ -325,7 +325,7 @@ fn read_batches(
         match row {
             Ok(row) => batch.push(row),
             Err(error) => {
-                // What came before the break is stored; the receiver is gone only with its request.
+                // Rows that came before the break are stored; the receiver is gone only with its request.
                 let _ = batches.blocking_send(batch);
                 return Err(error);
             }

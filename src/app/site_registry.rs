@@ -27,7 +27,7 @@ pub struct SiteRegistry {
     sites: ArcSwap<HashMap<SiteId, Arc<ActiveSite>>>,
     /// Held from reading the store to replacing the map, so that no change undoes a later one.
     change: Mutex<()>,
-    /// What is known may be of a history that the database has not; it is read again, whatever revision it has.
+    /// True if the known sites may be of a history that the database has not; they are read again, whatever revision.
     is_distrusted: AtomicBool,
     randomness: Randomness,
     /// Events of a site that a reader may continue after.

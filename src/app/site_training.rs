@@ -1,4 +1,4 @@
-//! What is particular to training runs of sites: their request, and which cameras are trained.
+//! Training runs of sites: their request, and which cameras are trained.
 
 use jiff::Timestamp;
 

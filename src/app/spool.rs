@@ -1,6 +1,6 @@
-//! What clients send in pieces and blocking code reads whole: in memory up to a size, in a temporary file beyond.
+//! Bodies that clients send in pieces and blocking code reads whole: in memory up to a size, beyond in temporary files.
 //!
-//! Never here: memory or disk beyond the quotas of all imports.
+//! Does not use memory or disk beyond the quotas of all imports.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -16,7 +16,7 @@ use crate::domain::{Error, ErrorKind, IdempotentRequest, RequestHasher, Result};
 
 /// A body to be read by blocking code. What it holds of the quotas is given back when it is dropped.
 pub struct Spooled {
-    /// What was sent.
+    /// The content that was sent.
     pub content: Content,
     /// Its share of the quotas.
     pub leases: SpoolLeases,
@@ -82,7 +82,7 @@ impl Read for Spooled {
     }
 }
 
-/// What a spooled body holds of the quotas of all imports.
+/// The leases of a spooled body in the quotas of all imports.
 pub struct SpoolLeases {
     memory: Lease,
     disk: Lease,
@@ -109,7 +109,7 @@ impl Spool {
     /// An empty one.
     ///
     /// # Errors
-    /// `Overloaded` if the client has as many imports under way as it may.
+    /// `Overloaded` if the client has reached its limit of imports under way.
     pub fn new(app: &App, client: ClientId) -> Result<Self> {
         Ok(Self {
             memory_bytes: app.limits.import_memory_bytes,

@@ -30,7 +30,7 @@ impl Backup {
     }
 }
 
-/// What a verified database holds, in words.
+/// The contents of a verified database, in words.
 pub(super) fn contents(report: &DatabaseReport) -> String {
     let DatabaseReport { cameras, samples, models, bytes, .. } = report;
     format!("{cameras} cameras, {samples} samples, {models} model versions, {bytes} bytes, verified")

@@ -28,6 +28,8 @@ use crate::paper_experiments::{self, RealRecording, Recordings, Worlds};
 const MAX_REPORTED_ROWS: u64 = 20;
 /// Largest number of seeds of one evaluation.
 const MAX_SEEDS: u64 = 100;
+/// Largest seed of the first draw; the known models have the seeds from a million on.
+const MAX_FIRST_DRAW: u64 = 900_000;
 
 /// Compare methods on a test file, without a server
 #[derive(Args)]
@@ -83,13 +85,22 @@ pub(super) struct Evaluate {
     /// identity.csv and truth.csv, such as `simulate site` writes
     #[arg(long, value_name = "DIR", conflicts_with_all = ["train", "test", "paper"])]
     site: Option<PathBuf>,
-    /// Number of times that the receivers' errors are drawn again about the true positions, for --site [default: the
-    /// recorded fixes]
+    /// Number of times that carriers, fixes and boxes are drawn again about the true positions, for --site [default: the
+    /// recording as it is]
     #[arg(long, value_name = "N", requires = "site", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=MAX_SEEDS))]
+    draws: u64,
+    /// The same of the errors of the fixes alone
+    #[arg(long, value_name = "N", requires = "site", conflicts_with = "draws", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=MAX_SEEDS))]
     redraws: u64,
-    /// Seed of the first of these, for --site
-    #[arg(long, value_name = "N", requires = "site", default_value_t = 1)]
-    first_redraw: u64,
+    /// Seed of the first draw, for --site
+    #[arg(long, alias = "first-redraw", value_name = "N", requires = "site", default_value_t = 1, value_parser = clap::value_parser!(u64).range(0..=MAX_FIRST_DRAW))]
+    first_draw: u64,
+    /// Evaluate how boxes are matched with receivers instead of the world tracks, for --site: with a model that is known
+    #[arg(long = "match", requires = "draws")]
+    matching: bool,
+    /// The same with nothing known, too, which takes minutes for each draw
+    #[arg(long, requires = "matching")]
+    without_model: bool,
     /// Write the page to this file, for --paper
     #[arg(long, value_name = "FILE", requires = "paper", default_value = "docs/explanation/accuracy.md")]
     out: PathBuf,
@@ -105,9 +116,16 @@ impl Evaluate {
             return self.write_paper_page();
         }
         if let Some(folder) = &self.site {
-            let draws = Draws { count: self.redraws, first_seed: self.first_redraw };
-            let report = evaluate_site::evaluate(folder, self.image_size, &draws)?;
-            return self.json.as_ref().map_or(Ok(()), |path| write_text(path, &report.to_json()?));
+            let only_errors = self.redraws > 0;
+            let count = if only_errors { self.redraws } else { self.draws };
+            let draws = Draws { count, first_seed: self.first_draw, only_errors };
+            let report = if self.matching {
+                evaluate_site::evaluate_matching(folder, self.image_size, &draws, self.without_model)?
+                    .to_json()?
+            } else {
+                evaluate_site::evaluate(folder, self.image_size, &draws)?.to_json()?
+            };
+            return self.json.as_ref().map_or(Ok(()), |path| write_text(path, &report));
         }
         let (Some(train), Some(test)) = (&self.train, &self.test) else {
             anyhow::bail!("give --train and --test")

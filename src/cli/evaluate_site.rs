@@ -5,21 +5,29 @@ use std::path::Path;
 use super::output::print_line;
 use super::progress::Progress;
 use super::site_recording;
-use crate::domain::{GaussMarkovNoise, ImageSize, NoiseCorrelation};
+use crate::domain::ImageSize;
 use crate::evaluation::site::{
-    Degradation, Identities, SiteCase, SiteOutcome, SiteRecording, SiteReport, SiteTraining, TrainedSite,
-    track_site, train_site,
+    Degradation, Identities, MatchingReport, SiteCase, SiteOutcome, SiteRecording, SiteReport, SiteTraining,
+    TrainedSite, track_site, train_site,
 };
 
-/// Noise of redrawn receivers: 2.5 m per axis with a time constant of 30 s, and 0.75 m white.
-const REDRAWN_COLOURED_M: f64 = 2.5;
-const REDRAWN_WHITE_M: f64 = 0.75;
-const REDRAWN_TIME_CONSTANT_S: f64 = 30.0;
-
-/// Seeds of the redraws, and whether the recorded fixes come first.
+/// Number of draws and the seed of the first; without any, the recording is taken as it is.
 pub(super) struct Draws {
     pub(super) count: u64,
     pub(super) first_seed: u64,
+    /// Whether only the errors of the fixes are drawn.
+    pub(super) only_errors: bool,
+}
+
+impl Draws {
+    fn of(&self, recording: &SiteRecording, draw: u64) -> SiteRecording {
+        let seed = self.first_seed + draw;
+        match (self.count, self.only_errors) {
+            (0, _) => recording.clone(),
+            (_, true) => recording.with_redrawn_fixes(seed),
+            (_, false) => recording.redrawn(seed),
+        }
+    }
 }
 
 /// Trains and tracks a recorded site in several ways and prints a table of figures.
@@ -34,11 +42,7 @@ pub(super) fn evaluate(
     let mut progress = Progress::new("{spinner} {pos}/{len} {msg}");
     let count = draws.count.max(1);
     for draw in 0..count {
-        let drawn = if draws.count == 0 {
-            recording.clone()
-        } else {
-            recording.with_redrawn_fixes(redrawn_noise(), draws.first_seed + draw)
-        };
+        let drawn = draws.of(&recording, draw);
         let trained =
             [SiteTraining::Together, SiteTraining::Apart].map(|training| train_site(&drawn, training));
         let [together, apart] = trained;
@@ -67,11 +71,23 @@ pub(super) fn evaluate(
     Ok(report)
 }
 
-fn redrawn_noise() -> GaussMarkovNoise {
-    let variance_m2 = REDRAWN_COLOURED_M.powi(2) + REDRAWN_WHITE_M.powi(2);
-    let white_share = REDRAWN_WHITE_M.powi(2) / variance_m2;
-    let correlation = NoiseCorrelation { white_share, time_constant_s: REDRAWN_TIME_CONSTANT_S };
-    GaussMarkovNoise { variance_m2, correlation }
+/// Matches the boxes of each camera with the receivers and prints tables of figures.
+pub(super) fn evaluate_matching(
+    folder: &Path,
+    image_size: Option<ImageSize>,
+    draws: &Draws,
+    with_search: bool,
+) -> anyhow::Result<MatchingReport> {
+    let recording = site_recording::read(folder, image_size)?;
+    let mut report = MatchingReport::new(&recording);
+    let mut progress = Progress::new("{spinner} {pos}/{len} {msg}");
+    for draw in 0..draws.count {
+        progress.set(draw, draws.count, "draws");
+        report.add_draw(&recording, draws.first_seed + draw, with_search)?;
+    }
+    progress.finish();
+    print_line(&report.table().trim_end())?;
+    Ok(report)
 }
 
 /// One row of the table.

@@ -23,7 +23,7 @@ enum Coding {
     Zstd,
 }
 
-/// Whether a path stands for standard input or output.
+/// True if a path stands for standard input or output.
 pub(super) fn is_standard(path: &Path) -> bool {
     path.as_os_str() == "-"
 }

@@ -15,6 +15,7 @@ use crate::domain::{
     CameraId, Error, ErrorKind, GnssBiasSigma, ImageSize, NewCamera, NewSite, OnConflict, SiteId, TargetId,
 };
 use crate::exchange::{CsvLayout, Format};
+use crate::geo::Position;
 
 /// Import samples from a file into a camera
 #[derive(Args)]
@@ -33,6 +34,11 @@ pub(super) struct Import {
     /// Size of the camera's image, for --create
     #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = image_size, requires = "create")]
     image_size: Option<ImageSize>,
+    /// Rough position of the camera itself, degrees, for --create: fixes that are far from it are told
+    #[arg(
+        long, value_name = "LONGITUDE,LATITUDE", value_parser = location, requires = "create", allow_hyphen_values = true
+    )]
+    location: Option<Position>,
     /// Standard deviation per axis of the bias that all fixes have in common, m, for --create [default: the
     /// model's own prior]
     #[arg(long, value_name = "S", value_parser = gnss_bias_sigma, requires = "create")]
@@ -109,6 +115,7 @@ impl Import {
         }
         let profile = NewCamera {
             image_size: self.image_size,
+            location: self.location,
             gnss_bias_sigma: self.gnss_bias_sigma_m,
             site: self.site.clone(),
             ..NewCamera::named(self.camera.clone())
@@ -178,6 +185,16 @@ pub(super) fn image_size(text: &str) -> Result<ImageSize, String> {
         .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
     let (width_px, height_px) = sides.ok_or("must be WIDTHxHEIGHT in pixels, such as 1920x1080")?;
     ImageSize::new(width_px, height_px).map_err(|error| error.to_string())
+}
+
+/// A position as `103.98678,30.6280135`.
+fn location(text: &str) -> Result<Position, String> {
+    let degrees = text
+        .split_once(',')
+        .and_then(|(longitude, latitude)| Some((longitude.parse().ok()?, latitude.parse().ok()?)));
+    let (longitude_deg, latitude_deg) =
+        degrees.ok_or("must be LONGITUDE,LATITUDE in degrees, such as 103.98678,30.6280135")?;
+    Position::new(longitude_deg, latitude_deg).map_err(|error| error.to_string())
 }
 
 /// A standard deviation in metres.

@@ -38,7 +38,7 @@ enum KeysCommand {
 
 #[derive(Args)]
 struct Create {
-    /// What the key is for
+    /// Purpose of the key
     #[arg(long, value_name = "NAME")]
     name: String,
     /// viewer, edge, operator or admin

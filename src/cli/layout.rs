@@ -14,7 +14,7 @@ pub(super) struct LayoutFlags {
     /// times are read [default: the documented columns, separated by commas]
     #[arg(long, value_name = "COLUMNS")]
     columns: Option<ColumnNames>,
-    /// What the columns left, top, width and height hold: left_top, centre (of the box, and its size) or
+    /// Meaning of the columns left, top, width and height: left_top, centre (of the box, and its size) or
     /// corners (the last two are right and bottom) [default: by the names of the columns]
     #[arg(long, value_name = "FORM")]
     box_form: Option<BoxForm>,

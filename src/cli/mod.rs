@@ -1,7 +1,7 @@
 //! The command line: one file per subcommand. A subcommand reads its flags, calls the layers below, and
 //! prints the result.
 //!
-//! Never here: rules of the domain.
+//! Does not contain rules of the domain.
 
 mod backup;
 mod config;
@@ -32,6 +32,7 @@ mod simulate;
 mod simulate_site;
 mod site_recording;
 mod summary;
+mod tls;
 mod train;
 
 use std::path::{Path, PathBuf};
@@ -93,9 +94,11 @@ enum Command {
     Replay(replay::Replay),
     /// Create, list and revoke the keys that clients of a server present
     Keys(keys::Keys),
+    /// Make the certificate that browsers on phones need, without a name of one's own
+    Tls(tls::Tls),
     /// Copy the database into one verified file, also while a server uses it
     Backup(backup::Backup),
-    /// Put a backup in place of the database
+    /// Replace the database by a backup
     Restore(restore::Restore),
     /// Copy everything from a data folder or database into another one, and compare
     Copy(copy::Copy),
@@ -143,6 +146,7 @@ impl Cli {
             Command::Simulate(command) => command.run(),
             Command::Replay(command) => command.run(file),
             Command::Keys(command) => command.run(file),
+            Command::Tls(command) => command.run(),
             Command::Backup(command) => command.run(file),
             Command::Restore(command) => command.run(file),
             Command::Copy(command) => command.run(),
@@ -191,7 +195,7 @@ impl DataFolder {
     }
 }
 
-/// What to do where there is no data folder.
+/// The rule for a missing data folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum MissingData {
     Create,

@@ -16,12 +16,12 @@ pub(super) fn be_quiet() {
     QUIET.store(true, Ordering::Relaxed);
 }
 
-/// Whether progress and notes are suppressed.
+/// True if progress and notes are suppressed.
 pub(super) fn is_quiet() -> bool {
     QUIET.load(Ordering::Relaxed)
 }
 
-/// Whether the reader of standard output has gone, as in `sightfix openapi | head -1`: it wants no more, and a
+/// True if the reader of standard output has gone, as in `sightfix openapi | head -1`: it wants no more, and a
 /// command that ends early for it has not failed.
 #[must_use]
 pub fn reader_is_gone() -> bool {

@@ -14,7 +14,8 @@ use super::output::print_note;
 use super::summary::{Summary, SummaryFlags};
 use super::{DataFolder, MissingData, camera_id, open_app, receiver_id, runtime, target_id};
 use crate::app::{
-    MatchReport, MatchRequest, PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part,
+    MatchReport, MatchRequest, MatchedPair, PairingCounts, Part, Recording, RecordingLimits, RejectedParts,
+    of_part,
 };
 use crate::clock::Clock;
 use crate::config::Limits;
@@ -49,11 +50,12 @@ pub(super) struct Pair {
     /// Time of the first frame of such a file, such as 2026-06-01T12:00:00Z
     #[arg(long, value_name = "TIME", value_parser = parse_time, requires = "detections_format")]
     start_time: Option<Timestamp>,
-    /// Fixes as CSV, NMEA, GPX or gpsd reports (.json), by file extension, which may be followed by .gz or .zst; - is standard
+    /// Fixes as CSV, NMEA, GPX, gpsd reports (.json) or solutions of RTKLIB (.pos), by file extension, which may be
+    /// followed by .gz or .zst; - is standard
     /// input
     #[arg(long, value_name = "FILE")]
     fixes: PathBuf,
-    /// Format of the fixes if the extension does not determine it: csv, nmea, gpx or gpsd
+    /// Format of the fixes if the extension does not determine it: csv, nmea, gpx, gpsd or rtklib
     #[arg(long, value_name = "FORMAT")]
     fixes_format: Option<FixFormat>,
     /// Output file for `sightfix import`: CSV, NDJSON or JSON, by file extension, which may be followed by .gz or
@@ -105,7 +107,7 @@ pub(super) struct Pair {
 /// Matching of boxes that have only a tracker's ids with fixes that have only receivers'
 #[derive(Args)]
 struct MatchFlags {
-    /// Find out whose boxes show whose receivers: boxes need only a tracker's ids. Sure samples get the
+    /// Match boxes with receivers: boxes need only a tracker's ids. Sure samples get the
     /// receiver's id as target_id, and the columns tracker_id and match_probability
     #[arg(long = "match", conflicts_with_all = ["receivers", "estimate_offset"])]
     matches: bool,
@@ -181,7 +183,7 @@ impl Pair {
             return self.write_matched(recording, &receivers, &settings, out, config, &summary);
         }
         let (paired, counts, rejected) = recording.paired(&receivers, &settings);
-        print_counts(&summary, &counts, &rejected)?;
+        print_counts(&summary, &counts, &rejected, None)?;
         anyhow::ensure!(counts.paired > 0, "nothing could be paired; {} is not written", out.display());
         let mut file = Output::create(out)?;
         if self.keep_unpaired {
@@ -213,7 +215,7 @@ impl Pair {
         let matched = recording.matched(receivers, &request)?;
         print_match(summary, &matched.report)?;
         let (paired, counts, rejected) = matched.recording.paired(&matched.receivers, settings);
-        print_counts(summary, &counts, &rejected)?;
+        print_counts(summary, &counts, &rejected, Some(&matched.report))?;
         anyhow::ensure!(counts.paired > 0, "nothing could be paired; {} is not written", out.display());
         let mut file = Output::create(out)?;
         let mut writer = MatchedSampleWriter::new(&mut file, files::format_of(out, None)?);
@@ -230,7 +232,7 @@ impl Pair {
         anyhow::ensure!(!both, "only one of --detections and --fixes can be standard input");
         let format = files::fix_format_of(&self.fixes, self.fixes_format).with_context(|| {
             let name = self.fixes.display();
-            format!("{name}: the extension does not determine the format; give --fixes-format csv, nmea, gpx or gpsd")
+            format!("{name}: the extension does not determine the format; give --fixes-format csv, nmea, gpx, gpsd or rtklib")
         })?;
         if let Some(out) = &self.out {
             files::format_of(out, None)?; // fail early
@@ -368,9 +370,46 @@ fn print_match(summary: &Summary, report: &MatchReport) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn print_counts(summary: &Summary, counts: &PairingCounts, rejected: &RejectedParts) -> anyhow::Result<()> {
+/// What was matched, in the names of the answer over REST, and the scores of the search without a model.
+fn match_document(report: &MatchReport) -> serde_json::Value {
+    let pair = |pair: &MatchedPair| {
+        serde_json::json!({
+            "receiver_id": pair.receiver_id.as_str(),
+            "tracker_id": pair.tracker_id.as_str(),
+            "from": pair.from,
+            "to": pair.to,
+            "detections": pair.detections,
+            "probability": pair.probability,
+        })
+    };
+    let offset = |(id, offset): &(ReceiverId, ClockOffset)| serde_json::json!({ "receiver_id": id.as_str(), "offset_s": offset.seconds() });
+    let score = |score: f64| score.is_finite().then_some(score);
+    serde_json::json!({
+        "tracklets": report.tracklets,
+        "receivers": report.receivers,
+        "cuts": report.cuts,
+        "min_probability": report.min_probability,
+        "matched_detections": report.matched_detections,
+        "unsure_detections": report.unsure_detections,
+        "pairs": report.pairs.iter().map(pair).collect::<Vec<_>>(),
+        "clock_offsets": report.clock_offsets.iter().map(offset).collect::<Vec<_>>(),
+        "scores": report.world.map(|world| serde_json::json!({
+            "best": world.best,
+            "shifted_clocks": score(world.best_shifted),
+            "another_place": score(world.second),
+        })),
+    })
+}
+
+fn print_counts(
+    summary: &Summary,
+    counts: &PairingCounts,
+    rejected: &RejectedParts,
+    matched: Option<&MatchReport>,
+) -> anyhow::Result<()> {
     let PairingCounts { detections, fixes, paired, .. } = counts;
     summary.document(&serde_json::json!({
+        "matching": matched.map(match_document),
         "detections": detections,
         "fixes": fixes,
         "paired": paired,

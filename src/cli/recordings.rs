@@ -1,4 +1,4 @@
-//! The real recordings behind `sightfix evaluate --paper`, from their folder.
+//! The real recordings for `sightfix evaluate --paper`, from their folder.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;

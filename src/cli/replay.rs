@@ -16,8 +16,8 @@ use super::progress::Progress;
 use super::{camera_id, files, receiver_id, runtime, target_id};
 use crate::clock::Clock;
 use crate::config::{Config, Overrides};
-use crate::domain::{CameraId, KeySecret, ReceiverId, TargetId, TimeBounds};
-use crate::exchange::{self, ObservedRow, RowRules};
+use crate::domain::{CameraId, KeySecret, LiveItem, ReceiverId, TargetId, TimeBounds};
+use crate::exchange::{self, RowRules};
 use crate::replay::{
     Counters, FaultShares, FixOwner, Pace, RecordedStream, ReplayOptions, ReplayReport, replay,
 };
@@ -28,7 +28,8 @@ const PROGRESS_INTERVAL: Duration = Duration::from_millis(200);
 /// Stream recorded boxes and fixes to a server, as one or many cameras
 #[derive(Args)]
 pub(super) struct Replay {
-    /// Rows with boxes, fixes or both, as CSV, NDJSON or JSON, by file extension
+    /// Rows with boxes, fixes or both, as CSV, NDJSON or JSON, by file extension; boxes may have a tracker_id and fixes a
+    /// receiver_id instead of a target_id
     #[arg(value_name = "FILE", required_unless_present = "detections")]
     file: Option<PathBuf>,
     /// Boxes that were recorded separately from the fixes
@@ -37,10 +38,10 @@ pub(super) struct Replay {
     /// Fixes that were recorded separately, merged with the boxes by time
     #[arg(long, value_name = "FILE", requires = "detections")]
     fixes: Option<PathBuf>,
-    /// Target of the fixes that name none [default: the only target]
+    /// Target of the fixes that name neither target nor receiver [default: the only target]
     #[arg(long, value_name = "ID", value_parser = target_id, requires = "fixes")]
     fix_target: Option<TargetId>,
-    /// Receiver of the fixes that name no target; the camera's profile maps it to a target
+    /// Receiver of the fixes that name neither; the camera's profile maps it to a target
     #[arg(long, value_name = "ID", value_parser = receiver_id, requires = "fixes", conflicts_with = "fix_target")]
     receiver: Option<ReceiverId>,
     #[command(flatten)]
@@ -221,9 +222,9 @@ impl Delivery {
 }
 
 /// The valid rows of a file; the others are reported on standard error and skipped.
-fn rows(path: &Path, rules: &RowRules) -> anyhow::Result<Vec<ObservedRow>> {
+fn rows(path: &Path, rules: &RowRules) -> anyhow::Result<Vec<LiveItem>> {
     let mut valid = Vec::new();
-    for row in exchange::read_observations(files::open_input(path)?, files::format_of(path, None)?, rules)? {
+    for row in exchange::read_live_items(files::open_input(path)?, files::format_of(path, None)?, rules)? {
         match row? {
             Ok(row) => valid.push(row),
             Err(row) => print_note(format_args!(

@@ -10,7 +10,7 @@ use super::{DataFolder, runtime};
 use crate::clock::Clock;
 use crate::store::{MissingDigest, restore};
 
-/// Put a backup in place of the database, which is kept under another name; no server may run
+/// Replace the database, which is kept under another name, by a backup; no server may run
 #[derive(Args)]
 pub(super) struct Restore {
     /// A file of `sightfix backup`

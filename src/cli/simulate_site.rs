@@ -27,6 +27,9 @@ pub(super) struct SimulateSite {
     /// Number of walkers
     #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u16).range(0..=1_000))]
     walkers: u16,
+    /// Share of the walkers who walk in groups of two to four
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
+    groups: f64,
     /// Number of vehicles
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u16).range(0..=1_000))]
     vehicles: u16,
@@ -76,6 +79,7 @@ impl SimulateSite {
             receiver_seed: self.receiver_seed,
             cameras: self.cameras.into(),
             walkers: self.walkers.into(),
+            group_share: self.groups,
             vehicles: self.vehicles.into(),
             receiver_share: self.receivers,
             duration_s: self.duration_s,
@@ -118,6 +122,7 @@ fn check(options: &SiteOptions) -> anyhow::Result<()> {
     );
     anyhow::ensure!((0.0..=100.0).contains(&options.box_noise_px), "--box-noise-px must be from 0 to 100");
     anyhow::ensure!((0.0..=1.0).contains(&options.receiver_share), "--receivers must be a share from 0 to 1");
+    anyhow::ensure!((0.0..=1.0).contains(&options.group_share), "--groups must be a share from 0 to 1");
     anyhow::ensure!((0.0..=0.95).contains(&options.missed_share), "--missed must be a share from 0 to 0.95");
     anyhow::ensure!(
         (0.0..=100.0).contains(&options.false_per_frame),
@@ -169,7 +174,7 @@ fn write_identities(out: &mut dyn Write, site: &SimulatedSite) -> std::io::Resul
     writeln!(out, "camera,target_id,person,from,until")?;
     for camera in &site.cameras {
         let mut latest: BTreeMap<&TargetId, (&TargetId, Timestamp, Timestamp)> = BTreeMap::new();
-        let mut spells = Vec::new();
+        let mut segments = Vec::new();
         for LabelledDetection { detection, target } in &camera.detections {
             let Some(target) = target else { continue };
             let time = detection.time;
@@ -177,13 +182,13 @@ fn write_identities(out: &mut dyn Write, site: &SimulatedSite) -> std::io::Resul
                 Some((person, _, until)) if *person == target => *until = time,
                 _ => {
                     let ended = latest.insert(&detection.target_id, (target, time, time));
-                    spells.extend(ended.map(|spell| (&detection.target_id, spell)));
+                    segments.extend(ended.map(|segment| (&detection.target_id, segment)));
                 }
             }
         }
-        spells.extend(latest);
-        spells.sort();
-        for (id, (person, from, until)) in spells {
+        segments.extend(latest);
+        segments.sort();
+        for (id, (person, from, until)) in segments {
             writeln!(out, "{},{id},{person},{from},{until}", camera.id)?;
         }
     }

@@ -11,19 +11,19 @@ use crate::domain::{CameraId, Detection, ImageSize, ReceivedFix, ReceiverId, Tar
 use crate::evaluation::site::{LabelledBox, RecordedCamera, RecordedFix, SiteRecording};
 use crate::geo::LocalPlane;
 
-/// A spell in which a tracker's id was of one target: camera, id, target, from, until.
-struct Spell {
+/// An interval in which a tracker's id was of one target: camera, id, target, from, until.
+struct Segment {
     target: TargetId,
     from: Timestamp,
     until: Timestamp,
 }
 
-type Spells = BTreeMap<(String, String), Vec<Spell>>;
+type Segments = BTreeMap<(String, String), Vec<Segment>>;
 
 /// Reads the folder. `phone-K` is carried by the target whose name ends with `-K`.
 pub(super) fn read(folder: &Path, image_size: Option<ImageSize>) -> anyhow::Result<SiteRecording> {
     let fixes = read_fixes(&folder.join("fixes.csv"))?;
-    let spells = read_spells(&folder.join("identity.csv"))?;
+    let segments = read_segments(&folder.join("identity.csv"))?;
     let truth = read_truth(&folder.join("truth.csv"))?;
     let names: BTreeSet<&TargetId> = truth.keys().map(|(_, target)| target).collect();
     let targets: Vec<TargetId> = names.into_iter().cloned().collect();
@@ -35,7 +35,7 @@ pub(super) fn read(folder: &Path, image_size: Option<ImageSize>) -> anyhow::Resu
         let id = CameraId::new(name).map_err(anyhow::Error::from)?;
         let boxes = read_boxes(&folder.join(format!("detections_{name}.csv")))?;
         let labelled = |detection: Detection| LabelledBox {
-            target: target_of(&spells, name, &detection).and_then(index_of),
+            target: target_of(&segments, name, &detection).and_then(index_of),
             time: detection.time,
             tracker_id: detection.target_id,
             bounding_box: detection.bounding_box,
@@ -87,31 +87,32 @@ fn receivers(fixes: &[ReceivedFix], targets: &[TargetId]) -> Vec<(ReceiverId, us
     ids.iter().filter_map(carrier).collect()
 }
 
-fn target_of<'a>(spells: &'a Spells, camera: &str, detection: &Detection) -> Option<&'a TargetId> {
+fn target_of<'a>(segments: &'a Segments, camera: &str, detection: &Detection) -> Option<&'a TargetId> {
     let key = (camera.to_owned(), detection.target_id.as_str().to_owned());
-    let is_then = |spell: &&Spell| (spell.from..=spell.until).contains(&detection.time);
-    spells.get(&key)?.iter().find(is_then).map(|spell| &spell.target)
+    let is_then = |segment: &&Segment| (segment.from..=segment.until).contains(&detection.time);
+    segments.get(&key)?.iter().find(is_then).map(|segment| &segment.target)
 }
 
 /// Columns camera, target_id, person, and optionally from and until where an id changes hands.
-fn read_spells(path: &Path) -> anyhow::Result<Spells> {
+fn read_segments(path: &Path) -> anyhow::Result<Segments> {
     let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
     let has_times = text.lines().next().is_some_and(|header| header.ends_with(",from,until"));
-    let rows: Vec<(String, String, Spell)> = if has_times {
+    let rows: Vec<(String, String, Segment)> = if has_times {
         read_columns(path, |[camera, id, person, from, until]: [&str; 5]| {
-            let spell = Spell { target: TargetId::new(person)?, from: from.parse()?, until: until.parse()? };
-            Ok((camera.to_owned(), id.to_owned(), spell))
+            let segment =
+                Segment { target: TargetId::new(person)?, from: from.parse()?, until: until.parse()? };
+            Ok((camera.to_owned(), id.to_owned(), segment))
         })?
     } else {
         read_columns(path, |[camera, id, person]: [&str; 3]| {
             let target = TargetId::new(person)?;
-            let spell = Spell { target, from: Timestamp::MIN, until: Timestamp::MAX };
-            Ok((camera.to_owned(), id.to_owned(), spell))
+            let segment = Segment { target, from: Timestamp::MIN, until: Timestamp::MAX };
+            Ok((camera.to_owned(), id.to_owned(), segment))
         })?
     };
-    let mut spells = Spells::new();
-    for (camera, id, spell) in rows {
-        spells.entry((camera, id)).or_default().push(spell);
+    let mut segments = Segments::new();
+    for (camera, id, segment) in rows {
+        segments.entry((camera, id)).or_default().push(segment);
     }
-    Ok(spells)
+    Ok(segments)
 }

@@ -1,4 +1,4 @@
-//! What a command prints when it is done: lines for people, or one JSON document for programs.
+//! The summary that a command prints when it is done: lines for people, or one JSON document for programs.
 
 use std::fmt::Display;
 use std::io::{self, Write as _};
@@ -9,7 +9,7 @@ use clap::Args;
 use super::files;
 use super::output::{print_line, print_note};
 
-/// What a command prints when it is done.
+/// The form of the summary that a command prints when it is done.
 #[derive(Args)]
 pub(super) struct SummaryFlags {
     /// Print the summary as one JSON document

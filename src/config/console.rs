@@ -14,7 +14,7 @@ const PMTILES_MAGIC: &[u8; 8] = b"PMTiles\x03";
 /// Tiles of the OpenStreetMap Foundation.
 const OPENSTREETMAP: &str = "https://tile.openstreetmap.org/{z}/{x}/{y}.png";
 
-/// What the operator's console shows beside the server's own values.
+/// The settings of the operator's console.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Console {
@@ -23,21 +23,33 @@ pub struct Console {
     pub tile_url: Option<String>,
     /// A PMTiles file of map tiles that the server itself offers; instead of `tile_url`.
     pub tile_file: Option<PathBuf>,
-    /// What the provider of the tiles asks to be shown on the map.
+    /// The attribution that the provider of the tiles asks for on the map.
     pub tile_attribution: Option<String>,
-    /// Whether the page offers the map of OpenStreetMap, whose server browsers ask once their user has agreed. Only without
-    /// tiles of these settings.
+    /// File with the authority (PEM) of the server's own certificate. Phones fetch it from `/authority.crt` to trust it.
+    pub authority: Option<PathBuf>,
+    /// True if the page offers the map of OpenStreetMap, whose server browsers ask once their user has agreed. Only
+    /// without tiles of these settings.
     pub offer_openstreetmap: bool,
 }
 
 impl Default for Console {
     fn default() -> Self {
-        Self { tile_url: None, tile_file: None, tile_attribution: None, offer_openstreetmap: true }
+        Self {
+            tile_url: None,
+            tile_file: None,
+            tile_attribution: None,
+            authority: None,
+            offer_openstreetmap: true,
+        }
     }
 }
 
 impl Console {
     pub(super) fn check(&self) -> anyhow::Result<()> {
+        if let Some(authority) = &self.authority {
+            std::fs::File::open(authority)
+                .with_context(|| format!("console.authority: cannot read {}", authority.display()))?;
+        }
         if let Some(url) = &self.tile_url {
             anyhow::ensure!(
                 tile_origin(url).is_some() && ["{z}", "{x}", "{y}"].iter().all(|part| url.contains(part)),

@@ -159,6 +159,7 @@ impl Config {
             ("connection_queue", limits.connection_queue),
             ("connection_unsettled", limits.connection_unsettled),
             ("connection_queue_bytes", limits.connection_queue_bytes),
+            ("connection_batch_bytes", limits.connection_batch_bytes),
             ("connection_clients", limits.connection_clients),
             ("export_files", limits.export_files),
             ("site_queue", limits.site_queue),

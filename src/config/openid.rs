@@ -99,7 +99,7 @@ impl OpenIdSettings {
     }
 }
 
-/// Whether nobody between can read what is sent to an origin.
+/// True if nobody between can read what is sent to an origin.
 fn is_confidential(origin: &str) -> bool {
     let Some(host) = origin.strip_prefix("http://") else { return true };
     let host = host.rsplit_once(':').map_or(host, |(host, _)| host);

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 pub struct Secret(pub(super) String);
 
 impl Secret {
-    /// The text.
+    /// Returns the secret text.
     #[must_use]
     pub fn reveal(&self) -> &str {
         &self.0

@@ -17,7 +17,7 @@ pub struct TlsSettings {
     pub key: Option<PathBuf>,
     /// File with the authority of client certificates (PEM); none are asked for without.
     pub client_ca: Option<PathBuf>,
-    /// What holders of client certificates may do: `viewer` if left out, `edge`, `operator`, `admin`.
+    /// The role of holders of client certificates: `viewer` if left out, `edge`, `operator`, `admin`.
     pub client_role: Option<String>,
     /// The cameras that the role `edge` is restricted to.
     pub client_camera_ids: Vec<String>,
@@ -38,7 +38,7 @@ impl TlsSettings {
         }
     }
 
-    /// What holders of client certificates may do.
+    /// Returns the scope of holders of client certificates.
     ///
     /// # Errors
     /// Names the setting that cannot be used.

@@ -1,4 +1,4 @@
-//! What opens a connection, and why it does not open.
+//! The credentials that open a connection, and the reasons why it does not open.
 
 use crate::exchange::{SaslMechanism, Secrets};
 
@@ -25,7 +25,7 @@ impl From<&str> for PeerError {
     }
 }
 
-/// What opens connections: credentials and trust.
+/// The credentials and the trusted certificates that open connections.
 pub(super) struct Credentials<'a> {
     pub(super) username: Option<&'a str>,
     /// How the user signs in to Kafka.

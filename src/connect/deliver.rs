@@ -1,8 +1,8 @@
 //! From the outbox to the receiver.
 
 use std::convert::Infallible;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use super::credentials::PeerError;
@@ -19,6 +19,15 @@ const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// The publisher of the same process begins beside the delivery.
 const PUBLISHER_WAIT: Duration = Duration::from_secs(1);
 
+/// The results of an attempt that the next one needs.
+#[derive(Default)]
+pub(super) struct Attempt {
+    /// True once a message was taken or delivered.
+    pub(super) progressed: AtomicBool,
+    /// The pause that the peer asks for.
+    pub(super) retry_after: OnceLock<Duration>,
+}
+
 /// Delivers the outbox of one sink.
 pub(super) struct Delivery<'a> {
     pub(super) app: &'a App,
@@ -32,10 +41,11 @@ pub(super) struct Delivery<'a> {
 }
 
 impl Delivery<'_> {
-    /// Opens the sink and delivers until it fails. `progressed` is set when something was delivered.
-    pub(super) async fn run(&self, progressed: &AtomicBool) -> Result<Infallible, PeerError> {
+    /// Opens the sink and delivers until it fails.
+    pub(super) async fn run(&self, attempt: &Attempt) -> Result<Infallible, PeerError> {
         let clock = &self.app.clock;
-        let mut sink = open::sink(self.app, self.id, self.settings, self.secrets, self.client_id).await?;
+        let mut sink =
+            open::sink(self.app, self.id, self.settings, self.secrets, (self.client_id, true)).await?;
         // A sink that is seen running misses no position of this process's cameras.
         let _ = tokio::time::timeout(PUBLISHER_WAIT, self.live.publishing.wait()).await;
         self.live.enter(ConnectionState::Running, clock.now());
@@ -58,7 +68,11 @@ impl Delivery<'_> {
             if !outcomes.is_empty() {
                 self.app.store.settle_outbox(self.key, &outcomes).await?;
                 self.report(&messages, &outcomes);
-                progressed.store(true, Ordering::Relaxed);
+                attempt.progressed.store(true, Ordering::Relaxed);
+            }
+            if let (Err(_), Some(pause)) = (&delivered, sink.retry_after()) {
+                // The only one to set it, before this attempt ends.
+                let _ = attempt.retry_after.set(pause);
             }
             delivered?;
         }

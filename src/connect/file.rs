@@ -56,7 +56,7 @@ impl FileSink {
         Ok(Self { folder, settings, current: None })
     }
 
-    /// Whether a message of this time still goes to the current file.
+    /// True if a message of this time still goes to the current file.
     fn takes(&self, time: Timestamp) -> bool {
         self.current.as_ref().is_some_and(|file| {
             let age_s = time.duration_since(file.began_at).as_secs_f64();

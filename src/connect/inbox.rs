@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 
-/// Bytes that a message takes up besides its content.
+/// Bytes that a message occupies besides its content.
 const OVERHEAD_BYTES: usize = 128;
 
 /// Bytes that one source may hold of what it has read and nobody has taken.
@@ -29,17 +29,17 @@ impl ByteBudget {
         self.bytes
     }
 
-    /// What is charged for so many bytes: what is larger than the whole budget waits for all of it.
+    /// The charge for a number of bytes: more than the whole budget waits for all of it.
     fn charge(&self, bytes: usize) -> u32 {
         u32::try_from(bytes.min(self.bytes)).unwrap_or(u32::MAX)
     }
 
-    /// Bytes, if so many are free now.
+    /// Returns the bytes, if that number is free now.
     pub(super) fn try_hold(&self, bytes: usize) -> Option<HeldBytes> {
         self.free.clone().try_acquire_many_owned(self.charge(bytes)).ok()
     }
 
-    /// Bytes, once so many are free.
+    /// Returns the bytes, once that number is free.
     async fn hold(&self, bytes: usize) -> Option<HeldBytes> {
         self.free.clone().acquire_many_owned(self.charge(bytes)).await.ok()
     }
@@ -80,7 +80,7 @@ impl<T> Inlet<T> {
 /// The end of a queue that messages are taken from; each with the bytes that it holds.
 pub(super) type Outlet<T> = mpsc::Receiver<(T, HeldBytes)>;
 
-/// A queue of at most so many messages and bytes.
+/// A queue with a limit of messages and of bytes.
 pub(super) fn inbox<T>(messages: usize, bytes: usize) -> (Inlet<T>, Outlet<T>) {
     let (queue, outlet) = mpsc::channel(messages.max(1));
     (Inlet { queue, budget: ByteBudget::new(bytes) }, outlet)

@@ -11,8 +11,8 @@ use super::source::{Message, Settled};
 use crate::admission::ClientId;
 use crate::app::{ActiveCamera, App, LastMessage, LiveConnection, LiveStream};
 use crate::domain::{
-    BoundingBox, CameraId, ConnectionId, Durability, Error, ErrorKind, ImageSize, LiveItem, ReceivedFix,
-    ReceiverId, Result, TargetId, TrackerId,
+    BoundingBox, CameraId, ConnectionId, Durability, Error, ErrorKind, ImageArea, ImageSize, LiveItem,
+    ReceivedFix, ReceiverId, Result, TargetId, TrackerId,
 };
 use crate::exchange::{
     DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, SourceSettings,
@@ -26,9 +26,20 @@ const OWNING_PAUSE: Duration = Duration::from_millis(200);
 /// The name that stands for any camera of a sender.
 const ANY_CAMERA: &str = "*";
 
+/// A camera of the sender.
+#[derive(Clone)]
+struct SenderCamera {
+    /// The camera here.
+    id: CameraId,
+    /// Size of the sender's stream, if it is not that of the camera's images.
+    stream_size: Option<ImageSize>,
+    /// The part of the camera's image whose boxes are taken.
+    area: Option<Arc<ImageArea>>,
+}
+
 /// Which camera an item is for.
 pub(super) struct Routing {
-    cameras: HashMap<String, (CameraId, Option<ImageSize>)>,
+    cameras: HashMap<String, SenderCamera>,
     fix_cameras: Vec<CameraId>,
     receiver: Option<ReceiverId>,
     ids_name_targets: bool,
@@ -36,10 +47,10 @@ pub(super) struct Routing {
 
 impl Routing {
     pub(super) fn of(settings: &SourceSettings) -> Result<Self> {
-        let cameras = settings
-            .cameras
-            .iter()
-            .map(|(name, mapping)| Ok((name.clone(), (mapping.camera()?, mapping.stream_size()?))));
+        let cameras = settings.cameras.iter().map(|(name, mapping)| {
+            let (id, stream_size) = (mapping.camera()?, mapping.stream_size()?);
+            Ok((name.clone(), SenderCamera { id, stream_size, area: mapping.area()?.map(Arc::new) }))
+        });
         Ok(Self {
             cameras: cameras.collect::<Result<_>>()?,
             fix_cameras: settings.fix_cameras()?,
@@ -48,13 +59,16 @@ impl Routing {
         })
     }
 
-    /// The camera of a sender's name, and the size of the sender's stream if it is another.
-    fn camera(&self, name: &str) -> Result<(CameraId, Option<ImageSize>)> {
+    /// The camera of a sender's name.
+    fn camera(&self, name: &str) -> Result<SenderCamera> {
         match self.cameras.get(name).or_else(|| self.cameras.get(ANY_CAMERA)) {
             Some(known) => Ok(known.clone()),
-            None => CameraId::new(name).map(|id| (id, None)).map_err(|_| {
-                Error::invalid("cameras", format!("names no camera for the sender's camera `{name}`"))
-            }),
+            None => {
+                let id = CameraId::new(name).map_err(|_| {
+                    Error::invalid("cameras", format!("names no camera for the sender's camera `{name}`"))
+                })?;
+                Ok(SenderCamera { id, stream_size: None, area: None })
+            }
         }
     }
 
@@ -134,19 +148,16 @@ impl Intake {
         self.pending_items
     }
 
-    /// Takes a message. What is wrong with it, or with one of its items, is counted and shown in the status.
+    /// Takes a message. Faults of the message, or of one of its items, are counted and shown in the status.
     ///
     /// # Errors
-    /// What failed is not the message's fault, so it must come again.
+    /// A failure that is not the message's fault, so the message must come again.
     pub(super) async fn take(&mut self, message: Message) -> Result<(), PeerError> {
         let now = self.app.clock.now();
         let time_bounds = self.app.live_time_bounds(now);
         let context = MessageContext { subject: &message.subject, received_at: now, time_bounds };
-        let read = if message.size_bytes > self.app.limits.connection_message_bytes {
-            Err(format!("is larger than {} bytes", self.app.limits.connection_message_bytes))
-        } else {
-            self.decoder.decode(&message.payload, &context)
-        };
+        let content = message.content(self.app.limits.connection_message_bytes);
+        let read = content.and_then(|content| self.decoder.decode(content, &context));
         let mut account = Account { now, ..Account::default() };
         let mut items = Vec::new();
         let outcome = match read {
@@ -175,7 +186,7 @@ impl Intake {
         let description = describe(&item);
         let targets = match item {
             MessageItem::Detection(detection) => match self.routing.camera(&detection.camera) {
-                Ok((camera, size)) => vec![(camera, LiveSource::Detection(detection, size))],
+                Ok(camera) => vec![(camera.id.clone(), LiveSource::Detection(detection, camera))],
                 Err(error) => return account.skip(&description, &error),
             },
             MessageItem::Fix(fix) => {
@@ -289,19 +300,19 @@ async fn open_stream(
     }
 }
 
-/// Whether another node has a camera, or may have it.
+/// True if another node has a camera, or may have it.
 const fn is_elsewhere(kind: ErrorKind) -> bool {
     matches!(kind, ErrorKind::CameraOnOtherNode | ErrorKind::CameraBetweenNodes)
 }
 
-/// Whether an error concerns one item, so that the rest goes on.
+/// True if an error concerns one item, so that the rest goes on.
 const fn is_of_item(kind: ErrorKind) -> bool {
     matches!(kind, ErrorKind::InvalidArgument | ErrorKind::CameraNotFound | ErrorKind::Overloaded)
 }
 
 /// An item with what turns it into that of a camera.
 enum LiveSource {
-    Detection(NamedDetection, Option<ImageSize>),
+    Detection(NamedDetection, SenderCamera),
     Fix(ReceivedFix, ReceiverId),
 }
 
@@ -315,12 +326,18 @@ impl LiveSource {
 
     fn item(self, camera: &ActiveCamera, routing: &Routing) -> Result<LiveItem> {
         Ok(match self {
-            Self::Detection(detection, stream_size) => {
+            Self::Detection(detection, sender) => {
                 let (target_id, tracker_id) = routing.identity(&detection)?;
                 let image_size = camera.image_size;
-                let bounding_box = box_in(image_size, detection.detected_box, stream_size)?;
+                let bounding_box = box_in(image_size, detection.detected_box, sender.stream_size)?;
                 let bounding_box =
                     image_size.map_or(Ok(bounding_box), |image_size| bounding_box.within(image_size))?;
+                if sender.area.is_some_and(|area| !area.contains_foot_of(&bounding_box)) {
+                    return Err(Error::invalid(
+                        "area",
+                        "the foot of the box is outside of the source's area",
+                    ));
+                }
                 LiveItem {
                     time: detection.time,
                     target_id,
@@ -372,12 +389,12 @@ fn box_in(
     BoundingBox::new(left * across, top * down, (right - left) * across, (bottom - top) * down)
 }
 
-/// What is said of a message that could be read and says nothing.
+/// The reading of a message that was decoded and is empty.
 const EMPTY_READING: &str = "the message contains no detection and no fix";
 /// Bytes of a message that was not taken which are kept as an example.
 const EXAMPLE_BYTES: usize = 200;
 
-/// What became of the items of one message.
+/// The counts of the items of one message.
 #[derive(Default)]
 struct Account {
     now: Timestamp,

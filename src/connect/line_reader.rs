@@ -10,12 +10,12 @@ const SHORT_BYTES: usize = 8 << 10;
 /// Bytes that are read at a time: after a line, less than a short line is left.
 const CHUNK_BYTES: usize = 4 << 10;
 
-/// What was read.
+/// The result of a read.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Line {
     /// Without its end.
     Whole(Bytes),
-    /// A line that is longer than may be; its rest is skipped.
+    /// A line that is longer than the limit; its rest is skipped.
     TooLong,
 }
 
@@ -26,7 +26,7 @@ pub(super) struct LineReader<S> {
     /// Bytes of the buffer that contain no line end.
     searched: usize,
     max_bytes: usize,
-    /// Whether the rest of a line that is too long is being skipped.
+    /// True if the rest of a line that is too long is being skipped.
     skips: bool,
     /// Where the bytes of a long line are charged; nowhere for a source that reads a single peer.
     budget: Option<ByteBudget>,
@@ -75,7 +75,7 @@ impl<S: AsyncRead + Unpin> LineReader<S> {
         None
     }
 
-    /// Whether the line that has begun may not become longer.
+    /// True if the line that has begun may not become longer.
     fn is_full(&mut self) -> bool {
         let length = self.buffer.len();
         if length > self.max_bytes {

@@ -25,7 +25,7 @@ use crate::exchange::Address;
 
 /// Time in which a client must send its first line.
 const FIRST_LINE: Duration = Duration::from_secs(30);
-/// A client that was silent for so long gives way when all places are taken.
+/// A client that was silent for this time is closed for a new one when all places are taken.
 const GIVES_WAY: Duration = Duration::from_secs(10);
 
 /// Takes lines of clients.
@@ -73,7 +73,7 @@ impl Source for LineListener {
     }
 }
 
-/// What the connection's status says of its clients.
+/// The clients of a connection, for its status.
 #[derive(Clone)]
 struct ClientStatus {
     live: Arc<LiveConnection>,

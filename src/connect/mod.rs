@@ -2,13 +2,13 @@
 //!
 //! A source is a [`source::Source`] and a decoder of [`crate::exchange`]; a sink is a [`sink::Sink`]. A task per
 //! connection of `/v1/connections` runs it, opens it again with growing pauses when it fails, and keeps its status.
-//! What a source took is acknowledged to its peer when what was to be stored is stored; what a sink is to deliver is
-//! stored first and deleted when its receiver has it.
+//! Messages of a source are acknowledged to its peer after their items are stored; messages of a sink are stored first,
+//! and deleted after its receiver has them.
 //!
-//! Never here: formats of messages (they are in `exchange`), rules of tracks (they are in `app`), a
+//! Does not contain formats of messages (they are in `exchange`), rules of tracks (they are in `app`), or a
 //! queue without a limit.
 
-// What other systems send reaches this module: nothing in it may end the process.
+// Input of other systems reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod credentials;

@@ -8,7 +8,7 @@
 //! The library's own encryption needs an outdated verifier of certificates, so an encrypted connection is opened here
 //! as any other, and the library reaches it by a Unix socket that only this process can open.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -27,18 +27,18 @@ use super::source::{Message, Settled, Source, SourceIdentity};
 use crate::app::LiveConnection;
 use crate::config::Limits;
 use crate::domain::OutboxMessage;
-use crate::exchange::{Address, Scheme, bracketed};
+use crate::exchange::{Address, Scheme, bracketed, home_assistant_discovery};
 
-/// What a PUBLISH packet has besides its payload, at most: topic and properties.
+/// The largest size of a PUBLISH packet besides its payload: topic and properties.
 const PACKET_OVERHEAD_BYTES: usize = 66_000;
 /// Messages that a sink may have under way; fewer where the broker states so.
 const PUBLISH_QUEUE: usize = 128;
-/// What a broker may send to a sink, which subscribes to nothing, bytes.
+/// The largest size of a broker's messages to a sink, which subscribes to nothing, bytes.
 const SINK_BYTES: usize = 64 << 10;
 /// Largest packet of a sink, bytes.
 const SINK_PACKET_BYTES: usize = 1 << 20;
 
-/// Of a broker that never answers a subscription.
+/// The error of a broker that never answers a subscription.
 const UNCONFIRMED: &str = "the broker has not confirmed the subscription within 10 s";
 
 const NEEDS_MQTT: &str = "connections need MQTT 5 or 3.1.1";
@@ -164,6 +164,16 @@ impl Link {
         }
     }
 
+    /// Has the broker keep a text under a topic.
+    async fn retain(&mut self, topic: &str, text: &'static str) -> Result<(), PeerError> {
+        self.client.retain(topic, Bytes::from_static(text.as_bytes())).await?;
+        loop {
+            if let Report::Published(_, outcome) = self.report().await?.0 {
+                return outcome.map_err(PeerError);
+            }
+        }
+    }
+
     async fn report(&mut self) -> Result<(Report, HeldBytes), PeerError> {
         match self.reports.recv().await {
             Some((Report::Failed(reason), _)) => Err(PeerError(reason)),
@@ -200,6 +210,7 @@ impl MqttSource {
             max_packet_bytes: limits.connection_message_bytes.saturating_add(PACKET_OVERHEAD_BYTES),
             queue,
             requests: unsettled + queue,
+            last_will: None,
         };
         let bytes = limits.connection_queue_bytes;
         let link = Link::open(address, credentials, &wishes, bytes, Some(live)).await?;
@@ -233,7 +244,7 @@ impl MqttSource {
         Ok(())
     }
 
-    /// What the broker sends next, if it is a message.
+    /// Returns the broker's next packet, if it is a message.
     async fn message(&mut self) -> Result<Option<(Incoming, HeldBytes)>, PeerError> {
         match self.link.report().await? {
             (Report::Message(message), held) => return Ok(Some((message, held))),
@@ -293,10 +304,36 @@ impl Source for MqttSource {
     }
 }
 
-/// Publishes messages.
+/// The messages to Home Assistant besides positions: the availability of the sink, and the configuration of each target.
+struct Announcer {
+    /// Has `online` while the connection is open, and `offline` by its last will.
+    availability_topic: String,
+    /// Topics of positions whose configurations the broker has of this connection.
+    announced: HashSet<String>,
+}
+
+impl Announcer {
+    /// Topics that are remembered; then all are announced again, which changes nothing.
+    const MOST_ANNOUNCED: usize = 4_096;
+
+    /// The configuration of a message's topic, if it was not announced yet.
+    fn configuration(&mut self, message: &OutboxMessage) -> Option<(String, Vec<u8>)> {
+        let OutboxMessage { subject, payload, .. } = message;
+        if self.announced.contains(subject) {
+            return None;
+        }
+        if self.announced.len() >= Self::MOST_ANNOUNCED {
+            self.announced.clear();
+        }
+        self.announced.insert(subject.clone());
+        home_assistant_discovery(subject, payload, &self.availability_topic, env!("CARGO_PKG_VERSION"))
+    }
+}
+
 pub(super) struct MqttSink {
     link: Link,
     media_type: &'static str,
+    announcer: Option<Announcer>,
 }
 
 impl MqttSink {
@@ -305,6 +342,7 @@ impl MqttSink {
         credentials: &Credentials<'_>,
         client_id: &str,
         media_type: &'static str,
+        availability_topic: Option<String>,
     ) -> Result<Self, PeerError> {
         let wishes = Wishes {
             client_id: client_id.to_owned(),
@@ -313,15 +351,31 @@ impl MqttSink {
             max_packet_bytes: SINK_PACKET_BYTES,
             queue: PUBLISH_QUEUE,
             requests: PUBLISH_QUEUE,
+            last_will: availability_topic.clone().map(|topic| (topic, "offline")),
         };
-        let link = Link::open(address, credentials, &wishes, SINK_BYTES, None).await?;
-        Ok(Self { link, media_type })
+        let mut link = Link::open(address, credentials, &wishes, SINK_BYTES, None).await?;
+        let announcer = match availability_topic {
+            Some(availability_topic) => {
+                within(OPEN_TIME, link.retain(&availability_topic, "online")).await?;
+                Some(Announcer { availability_topic, announced: HashSet::new() })
+            }
+            None => None,
+        };
+        Ok(Self { link, media_type, announcer })
     }
 
-    async fn publish(&self, message: &OutboxMessage) -> Result<(), PeerError> {
+    /// Publishes a message; whether something that announces it was published before.
+    async fn publish(&mut self, message: &OutboxMessage) -> Result<bool, PeerError> {
+        let client = &self.link.client;
+        let configuration = self.announcer.as_mut().and_then(|it| it.configuration(message));
+        let is_announced = configuration.is_some();
+        if let Some((topic, configuration)) = configuration {
+            client.retain(&topic, Bytes::from(configuration)).await?;
+        }
         let payload = Bytes::copy_from_slice(&message.payload);
         let OutboxMessage { subject, message_id, .. } = message;
-        self.link.client.publish(subject, payload, self.media_type, message_id).await
+        client.publish(subject, payload, self.media_type, message_id).await?;
+        Ok(is_announced)
     }
 }
 
@@ -332,22 +386,27 @@ impl Sink for MqttSink {
         outcomes: &'a mut Outcomes,
     ) -> BoxFuture<'a, Result<(), PeerError>> {
         Box::pin(async move {
-            for window in messages.chunks(PUBLISH_QUEUE) {
+            // Each message may come with its announcement.
+            for window in messages.chunks(PUBLISH_QUEUE / 2) {
+                // Numbers of the messages in the order of what was published; `None` for an announcement.
+                let mut published = VecDeque::with_capacity(PUBLISH_QUEUE);
                 for message in window {
-                    self.publish(message).await?;
+                    let is_announced = self.publish(message).await?;
+                    published.extend(is_announced.then_some(None));
+                    published.push_back(Some(message.number));
                 }
                 let settled = async {
                     // Acknowledgements need not come in order.
-                    let (mut unsent, mut sent) = (window.iter(), HashMap::new());
-                    let mut missing = window.len();
+                    let (mut missing, mut sent) = (published.len(), HashMap::new());
                     while missing > 0 {
                         match self.link.report().await?.0 {
                             Report::Sent(id) => {
-                                sent.extend(unsent.next().map(|message| (id, message.number)));
+                                sent.extend(published.pop_front().map(|number| (id, number)));
                             }
                             Report::Published(id, outcome) => {
                                 missing -= 1;
-                                outcomes.extend(sent.remove(&id).map(|number| (number, outcome)));
+                                let number = sent.remove(&id).flatten();
+                                outcomes.extend(number.map(|number| (number, outcome)));
                             }
                             _ => {}
                         }

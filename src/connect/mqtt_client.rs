@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use rumqttc::v5::mqttbytes as five;
-use rumqttc::v5::mqttbytes::v5::{ConnectReturnCode, PubAckReason, PublishProperties};
+use rumqttc::v5::mqttbytes::v5::{ConnectReturnCode, LastWill, PubAckReason, PublishProperties};
 use rumqttc::{Outgoing, Transport, v5};
 
 use super::credentials::{Credentials, PeerError};
@@ -21,10 +21,10 @@ pub(super) enum Version {
     ThreeOneOne,
 }
 
-/// What a client asks of its broker.
+/// The options that a client asks of its broker.
 pub(super) struct Wishes {
     pub(super) client_id: String,
-    /// Whether the broker keeps the session while the client is away.
+    /// True if the broker keeps the session while the client is away.
     pub(super) is_kept: bool,
     /// Messages that the broker may send before they are acknowledged; as many as it likes if `None`.
     pub(super) receive_maximum: Option<u16>,
@@ -34,6 +34,8 @@ pub(super) struct Wishes {
     /// Requests to the broker that are not sent: one for each message that may be acknowledged at once, or both sides
     /// would wait for each other.
     pub(super) requests: usize,
+    /// A topic, and what the broker publishes and retains there when the connection is lost.
+    pub(super) last_will: Option<(String, &'static str)>,
 }
 
 /// Where a broker is reached: a host, or the path of a Unix socket.
@@ -47,7 +49,7 @@ pub(super) struct Place {
 pub(super) struct Incoming {
     pub(super) topic: String,
     pub(super) payload: Bytes,
-    /// What is acknowledged; `None` for QoS 0.
+    /// The promise to acknowledge the message; `None` for QoS 0.
     pub(super) promise: Option<Promise>,
 }
 
@@ -57,7 +59,7 @@ pub(super) enum Promise {
     ThreeOneOne(Box<rumqttc::Publish>),
 }
 
-/// What the task of a connection reports.
+/// A report of the task of a connection.
 pub(super) enum Report {
     Subscribed(Result<(), String>),
     Connected,
@@ -72,7 +74,7 @@ pub(super) enum Report {
 }
 
 impl Report {
-    /// Bytes that it takes up.
+    /// Bytes that it occupies.
     pub(super) fn bytes(&self) -> usize {
         match self {
             Self::Message(message) => message.payload.len() + message.topic.len(),
@@ -80,7 +82,7 @@ impl Report {
         }
     }
 
-    /// Whether the connection has ended.
+    /// True if the connection has ended.
     pub(super) const fn is_end(&self) -> bool {
         matches!(self, Self::Failed(_) | Self::UnknownVersion(_))
     }
@@ -124,6 +126,9 @@ pub(super) fn client(
             if let Some((name, password)) = login {
                 options.set_credentials(name, password);
             }
+            if let Some((topic, text)) = &wishes.last_will {
+                options.set_last_will(LastWill::new(topic, *text, five::QoS::AtLeastOnce, true, None));
+            }
             let (client, connection) = v5::AsyncClient::new(options, wishes.requests);
             (Client::Five(client), Connection::Five(Box::new(connection)))
         }
@@ -139,6 +144,10 @@ pub(super) fn client(
             }
             if let Some((name, password)) = login {
                 options.set_credentials(name, password);
+            }
+            if let Some((topic, text)) = &wishes.last_will {
+                let qos = rumqttc::QoS::AtLeastOnce;
+                options.set_last_will(rumqttc::LastWill::new(topic, *text, qos, true));
             }
             let (client, mut connection) = rumqttc::AsyncClient::new(options, wishes.requests);
             connection.network_options.set_connection_timeout(OPEN_TIME.as_secs());
@@ -203,8 +212,22 @@ impl Client {
     }
 }
 
+impl Client {
+    /// Publishes with QoS 1 what the broker keeps for those who subscribe later.
+    pub(super) async fn retain(&self, topic: &str, payload: Bytes) -> Result<(), PeerError> {
+        match self {
+            Self::Five(client) => {
+                client.publish_bytes(topic, five::QoS::AtLeastOnce, true, payload).await.map_err(ended)
+            }
+            Self::ThreeOneOne(client) => {
+                client.publish_bytes(topic, rumqttc::QoS::AtLeastOnce, true, payload).await.map_err(ended)
+            }
+        }
+    }
+}
+
 impl Connection {
-    /// What happens next; `None` for what nobody asks for.
+    /// Returns the next report; `None` for an event that nobody needs.
     pub(super) async fn next(&mut self, is_connected: bool) -> Option<Report> {
         match self {
             Self::Five(connection) => match connection.poll().await {
@@ -222,7 +245,7 @@ impl Connection {
     }
 }
 
-/// Whether a broker may have failed to answer because it does not know MQTT 5: it says so, ends the connection, or
+/// True if a broker may have failed to answer because it does not know MQTT 5: it says so, ends the connection, or
 /// sends the answer of MQTT 3.1.1, which is two bytes shorter than a packet of MQTT 5 can be.
 const fn may_lack_mqtt_5(error: &v5::ConnectionError) -> bool {
     use ConnectReturnCode::{RefusedProtocolVersion, UnsupportedProtocolVersion};

@@ -58,13 +58,13 @@ pub(super) async fn source(
     })
 }
 
-/// Opens a sink of a connection.
+/// Opens a sink of a connection; one that is only tried announces nothing of itself.
 pub(super) async fn sink(
     app: &App,
     connection: &ConnectionId,
     settings: &SinkSettings,
     secrets: &Secrets,
-    client_id: &str,
+    (client_id, is_lasting): (&str, bool),
 ) -> Result<Box<dyn Sink>, PeerError> {
     let address = settings.address()?;
     let credentials = Credentials {
@@ -75,11 +75,18 @@ pub(super) async fn sink(
     };
     let media_type = match settings.format {
         OutgoingFormat::Cot | OutgoingFormat::Onvif => "application/xml",
-        OutgoingFormat::Json | OutgoingFormat::Gpx | OutgoingFormat::Kml => "application/json",
+        OutgoingFormat::Json | OutgoingFormat::HomeAssistant | OutgoingFormat::Gpx | OutgoingFormat::Kml => {
+            "application/json"
+        }
     };
     Ok(match address.scheme {
         Scheme::Mqtt | Scheme::Mqtts => {
-            Box::new(mqtt::MqttSink::open(&address, &credentials, client_id, media_type).await?)
+            let announces = is_lasting && settings.format == OutgoingFormat::HomeAssistant;
+            let availability_topic = announces.then(|| format!("sightfix-availability/{connection}"));
+            Box::new(
+                mqtt::MqttSink::open(&address, &credentials, client_id, media_type, availability_topic)
+                    .await?,
+            )
         }
         Scheme::Http | Scheme::Https => {
             Box::new(webhook::Webhook::open(&address, &credentials, media_type, app.clock.clone()).await?)

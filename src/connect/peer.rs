@@ -1,7 +1,9 @@
 //! Streams to the other end of a connection.
 
+use std::sync::Arc;
 use std::time::Duration;
 
+use rustls::ClientConfig;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
@@ -23,15 +25,24 @@ pub(super) async fn connect(
     is_encrypted: bool,
     credentials: &Credentials<'_>,
 ) -> Result<Box<dyn ByteStream>, PeerError> {
+    let tls = is_encrypted.then(|| tls::peer_config(credentials)).transpose()?;
+    dial(&address.host, address.port, tls).await
+}
+
+/// Opens a TCP connection to a port of a host, encrypted if a configuration is given.
+pub(super) async fn dial(
+    host: &str,
+    port: u16,
+    tls: Option<Arc<ClientConfig>>,
+) -> Result<Box<dyn ByteStream>, PeerError> {
     let open = async {
-        let stream = TcpStream::connect((address.host.as_str(), address.port)).await?;
+        let stream = TcpStream::connect((host, port)).await?;
         stream.set_nodelay(true)?;
-        if !is_encrypted {
+        let Some(tls) = tls else {
             return Ok(Box::new(stream) as Box<dyn ByteStream>);
-        }
-        let connector = TlsConnector::from(tls::peer_config(credentials)?);
-        let name = tls::server_name(&address.host)?;
-        Ok(Box::new(connector.connect(name, stream).await?) as Box<dyn ByteStream>)
+        };
+        let name = tls::server_name(host)?;
+        Ok(Box::new(TlsConnector::from(tls).connect(name, stream).await?) as Box<dyn ByteStream>)
     };
     within(OPEN_TIME, open).await
 }

@@ -7,9 +7,10 @@ use sha2::{Digest as _, Sha256};
 use uuid::Builder;
 
 use crate::app::{App, LiveConnection, SinkFeed, SinkPosition};
-use crate::domain::{ConnectionKey, Observation, OutboxMessage};
+use crate::domain::{ConnectionKey, Observation, OutboxMessage, TargetId};
 use crate::exchange::{
-    OutgoingFormat, OutgoingPosition, SinkSettings, cot_event, onvif_frame, position_json,
+    OutgoingFormat, OutgoingPosition, SinkSettings, cot_event, home_assistant_attributes, onvif_frame,
+    position_json,
 };
 
 /// Time over which messages are gathered for one transaction.
@@ -32,7 +33,7 @@ pub(super) struct Publisher<'a> {
 impl Publisher<'_> {
     pub(super) async fn run(self) {
         let Some(feed) = self.app.sink_feeds.of(self.key) else { return };
-        // Before anything else the database is told of the log, so that it will be known if this process ends too soon.
+        // The database first learns of the log, so that it is known if this process ends too soon.
         self.store(&[]).await;
         // Set before, where the settings have changed since.
         let _ = self.live.publishing.set(());
@@ -50,7 +51,8 @@ impl Publisher<'_> {
     /// Brings the oldest positions into the outbox. Where that is interrupted, they are still the oldest.
     async fn publish(&self, feed: &SinkFeed) {
         let positions = feed.oldest(MAX_BATCH);
-        let messages: Vec<_> = positions.iter().map(|position| self.message(position)).collect();
+        let sent = positions.iter().filter(|position| self.takes(position));
+        let messages: Vec<_> = sent.map(|position| self.message(position)).collect();
         self.store(&messages).await;
         let lost = feed.take_lost();
         self.live.update(|status| {
@@ -59,6 +61,13 @@ impl Publisher<'_> {
         });
         feed.settle(positions.last().map_or(0, |last| last.number));
         self.live.queued.notify_one();
+    }
+
+    /// Home Assistant keeps every device that it was told of, so it gets no target that a tracker's number names.
+    fn takes(&self, position: &SinkPosition) -> bool {
+        let number = position.observation.tracker_id().map(TargetId::from);
+        self.settings.format != OutgoingFormat::HomeAssistant
+            || number.as_ref() != Some(&position.point.target_id)
     }
 
     /// Appends messages, again and again until the outbox has them.
@@ -141,6 +150,7 @@ pub(super) fn payload(settings: &SinkSettings, position: &OutgoingPosition<'_>) 
         // Files are written from the same objects.
         OutgoingFormat::Json | OutgoingFormat::Gpx | OutgoingFormat::Kml => position_json(position),
         OutgoingFormat::Onvif => onvif_frame(position),
+        OutgoingFormat::HomeAssistant => home_assistant_attributes(position),
         OutgoingFormat::Cot => {
             let cot_type = settings.cot_type.as_deref().unwrap_or(DEFAULT_COT_TYPE);
             cot_event(position, cot_type, settings.stale_s.unwrap_or(DEFAULT_STALE_S))

@@ -1,4 +1,6 @@
-//! What a sink is.
+//! The interface of a sink.
+
+use std::time::Duration;
 
 use futures_util::future::BoxFuture;
 
@@ -16,6 +18,11 @@ pub(super) trait Sink: Send {
         messages: &'a [OutboxMessage],
         outcomes: &'a mut Outcomes,
     ) -> BoxFuture<'a, Result<(), PeerError>>;
+
+    /// The pause that the receiver asks for after a delivery has failed.
+    fn retry_after(&self) -> Option<Duration> {
+        None
+    }
 
     /// Completes once the connection has failed while nothing is delivered, for kinds that find out. Cancelling the wait
     /// loses nothing.

@@ -1,4 +1,4 @@
-//! What a source is.
+//! The interface of a source.
 
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
@@ -15,13 +15,27 @@ pub(super) struct Message {
     pub(super) payload: Bytes,
     /// Bytes of the whole content.
     pub(super) size_bytes: usize,
+    /// Why the source could not read it; its content then says where it is.
+    pub(super) unread: Option<String>,
 }
 
 impl Message {
     /// A message with its whole content.
     pub(super) const fn new(receipt: u64, subject: String, payload: Bytes) -> Self {
         let size_bytes = payload.len();
-        Self { receipt, subject, payload, size_bytes }
+        Self { receipt, subject, payload, size_bytes, unread: None }
+    }
+
+    /// The whole content, of at most so many bytes.
+    ///
+    /// # Errors
+    /// Why there is none.
+    pub(super) fn content(&self, most_bytes: usize) -> Result<&Bytes, String> {
+        match &self.unread {
+            Some(reason) => Err(reason.clone()),
+            None if self.size_bytes > most_bytes => Err(format!("is larger than {most_bytes} bytes")),
+            None => Ok(&self.payload),
+        }
     }
 }
 
@@ -37,7 +51,7 @@ pub(super) trait Source: Send {
     }
 }
 
-/// What became of a message.
+/// The outcome of a message.
 pub(super) struct Settled {
     pub(super) receipt: u64,
     /// `Ok` when all is stored that was to be stored of it, else why it cannot be read.
@@ -48,6 +62,6 @@ pub(super) struct Settled {
 pub(super) struct SourceIdentity {
     /// Name of the client, the same at every attempt.
     pub(super) client_id: String,
-    /// Whether the peer keeps what is not acknowledged while the source is away.
+    /// True if the peer keeps what is not acknowledged while the source is away.
     pub(super) is_lasting: bool,
 }

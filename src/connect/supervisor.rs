@@ -7,7 +7,7 @@
 use std::collections::{HashMap, HashSet};
 use std::convert::Infallible;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use rand::SeedableRng as _;
@@ -17,7 +17,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::credentials::PeerError;
-use super::deliver::Delivery;
+use super::deliver::{Attempt, Delivery};
 use super::intake::Intake;
 use super::open;
 use super::publish::Publisher;
@@ -40,7 +40,7 @@ const DEFAULT_INTERVAL_S: f64 = 1.0;
 /// Connections read at a time.
 const PAGE: u32 = 256;
 
-/// What a task does for a connection.
+/// The part of a connection that a task runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Part {
     /// Reads the source.
@@ -51,7 +51,7 @@ enum Part {
     Delivery,
 }
 
-/// What a task was started for.
+/// The version of the settings with which a task was started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct TaskVersion {
     key: ConnectionKey,
@@ -160,7 +160,7 @@ impl Supervisor {
             tracing::warn!(connection = %connection.id(), message);
             let error = Some((self.app.clock.now(), message.to_owned()));
             self.app.live_connection(connection).update(|status| {
-                // How many is not known.
+                // The number of positions is not known.
                 status.dropped += 1;
                 status.last_error = error;
             });
@@ -297,7 +297,7 @@ async fn run_part(app: &App, task: &WantedTask, live: &Arc<LiveConnection>) {
     }
 }
 
-/// What a connection does again after each failure.
+/// The work that a connection repeats after each failure.
 enum Work<'a> {
     Source { settings: &'a SourceSettings, secrets: &'a Secrets },
     Delivery(Delivery<'a>),
@@ -311,15 +311,15 @@ async fn retried(app: &App, connection: &Connection, live: &Arc<LiveConnection>,
     let mut was_failing = false;
     loop {
         live.enter(ConnectionState::Connecting, app.clock.now());
-        let progressed = AtomicBool::new(false);
-        let attempt = match &work {
+        let attempt = Attempt::default();
+        let ended = match &work {
             Work::Source { settings, secrets } => {
-                run_source(app, connection, settings, secrets, live, &progressed).await
+                run_source(app, connection, settings, secrets, live, &attempt).await
             }
-            Work::Delivery(delivery) => delivery.run(&progressed).await,
+            Work::Delivery(delivery) => delivery.run(&attempt).await,
         };
-        let Err(error) = attempt;
-        let has_progressed = progressed.into_inner();
+        let Err(error) = ended;
+        let has_progressed = attempt.progressed.into_inner();
         if has_progressed {
             backoff.reset();
         }
@@ -331,7 +331,8 @@ async fn retried(app: &App, connection: &Connection, live: &Arc<LiveConnection>,
         let now = app.clock.now();
         live.update(|status| status.last_error = Some((now, error.to_string())));
         live.enter(ConnectionState::Waiting, now);
-        tokio::time::sleep(backoff.next_delay().unwrap_or(LOOK_EVERY)).await;
+        let asked = attempt.retry_after.into_inner().unwrap_or_default();
+        tokio::time::sleep(backoff.next_delay().unwrap_or(LOOK_EVERY).max(asked)).await;
     }
 }
 
@@ -346,7 +347,7 @@ async fn run_source(
     settings: &SourceSettings,
     secrets: &Secrets,
     live: &Arc<LiveConnection>,
-    progressed: &AtomicBool,
+    attempt: &Attempt,
 ) -> Result<Infallible, PeerError> {
     let identity = SourceIdentity { client_id: client_id(connection), is_lasting: true };
     let mut source = open::source(app, connection, settings, secrets, &identity, live).await?;
@@ -357,7 +358,7 @@ async fn run_source(
         tokio::select! {
             message = source.next(), if intake.pending() < app.limits.connection_unsettled => {
                 intake.take(message?).await?;
-                progressed.store(true, Ordering::Relaxed);
+                attempt.progressed.store(true, Ordering::Relaxed);
             }
             () = tokio::time::sleep(SETTLE_EVERY), if intake.pending() > 0 => {}
         }

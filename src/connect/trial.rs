@@ -20,12 +20,12 @@ const WATCH_EVERY: Duration = Duration::from_millis(100);
 /// The target of test messages.
 const TEST_TARGET: &str = "sightfix-test";
 
-/// What came of trying a connection.
+/// The outcome of a trial of a connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Trial {
     /// The message, with what was read from it; `None` if none came in time.
     pub message: Option<LastMessage>,
-    /// What failed.
+    /// The error that ended the trial.
     pub error: Option<String>,
 }
 
@@ -90,7 +90,8 @@ async fn try_source(
     let now = app.clock.now();
     let time_bounds = app.live_time_bounds(now);
     let context = MessageContext { subject: &message.subject, received_at: now, time_bounds };
-    let reading = match source_decoder(settings).decode(&message.payload, &context) {
+    let content = message.content(app.limits.connection_message_bytes);
+    let reading = match content.and_then(|content| source_decoder(settings).decode(content, &context)) {
         Ok(read) => {
             let skipped = read.skipped.iter().map(|reason| format!("skipped: {reason}"));
             read.items.iter().map(describe).chain(skipped).take(32).collect()
@@ -111,7 +112,7 @@ async fn try_sink(
     let now = app.clock.now();
     let random = app.randomness.uuid_v7(now);
     let client_id = format!("sightfix-{}-test-{}", connection.id(), random.simple());
-    let mut sink = open::sink(app, connection.id(), settings, secrets, &client_id).await?;
+    let mut sink = open::sink(app, connection.id(), settings, secrets, (&client_id, false)).await?;
     let cameras = settings.cameras()?;
     let camera: &CameraId = cameras.first().ok_or_else(|| PeerError::from("the sink names no camera"))?;
     let target = TargetId::new(TEST_TARGET)?;

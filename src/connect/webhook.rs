@@ -4,6 +4,8 @@
 //! (`v1,` and the base64 of HMAC-SHA256 over `id.timestamp.body`) let the receiver recognise repetitions, old messages
 //! and forgeries. The key is the secret `signing_key`: base64 after `whsec_`, else its bytes.
 
+use std::time::Duration;
+
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
@@ -11,9 +13,11 @@ use futures_util::future::BoxFuture;
 use hmac::{Hmac, KeyInit as _, Mac as _};
 use http_body_util::{BodyExt as _, Full, Limited};
 use hyper::client::conn::http1::{self, SendRequest};
-use hyper::header::{AUTHORIZATION, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT};
-use hyper::{Request, StatusCode};
+use hyper::header::{AUTHORIZATION, CONTENT_TYPE, HOST, HeaderValue, RETRY_AFTER, USER_AGENT};
+use hyper::{HeaderMap, Request, StatusCode};
 use hyper_util::rt::TokioIo;
+use jiff::Timestamp;
+use jiff::fmt::rfc2822;
 use sha2::Sha256;
 use tokio_util::task::AbortOnDropHandle;
 
@@ -26,6 +30,8 @@ use crate::exchange::{Address, Scheme, bracketed};
 
 /// Bytes of an answer that are read, so that the connection can be used again.
 const MAX_ANSWER_BYTES: usize = 64 << 10;
+/// Longest pause that a receiver may ask for.
+const MAX_RETRY_AFTER: Duration = Duration::from_secs(300);
 
 /// An open connection to a receiver of webhooks.
 pub(super) struct Webhook {
@@ -36,6 +42,8 @@ pub(super) struct Webhook {
     signing_key: Option<Vec<u8>>,
     media_type: &'static str,
     clock: Clock,
+    /// The pause that the latest answer asks for.
+    retry_after: Option<Duration>,
     _connection: AbortOnDropHandle<()>,
 }
 
@@ -62,6 +70,7 @@ impl Webhook {
             signing_key,
             media_type,
             clock,
+            retry_after: None,
             _connection: AbortOnDropHandle::new(connection),
         })
     }
@@ -88,6 +97,7 @@ impl Webhook {
         self.sender.ready().await.map_err(broken)?;
         let answer = self.sender.send_request(request).await.map_err(broken)?;
         let status = answer.status();
+        self.retry_after = retry_after(answer.headers(), self.clock.now());
         let _ = Limited::new(answer.into_body(), MAX_ANSWER_BYTES).collect().await;
         match status {
             status if status.is_success() => Ok(Ok(())),
@@ -100,7 +110,22 @@ impl Webhook {
     }
 }
 
+/// The pause of a header `retry-after` (RFC 9110, 10.2.3), which has seconds or a date.
+fn retry_after(headers: &HeaderMap, now: Timestamp) -> Option<Duration> {
+    let text = headers.get(RETRY_AFTER)?.to_str().ok()?.trim();
+    let pause = match text.parse() {
+        Ok(seconds) => Duration::from_secs(seconds),
+        // A date that has passed asks for nothing.
+        Err(_) => rfc2822::parse(text).ok()?.timestamp().duration_since(now).try_into().ok()?,
+    };
+    Some(pause.min(MAX_RETRY_AFTER))
+}
+
 impl Sink for Webhook {
+    fn retry_after(&self) -> Option<Duration> {
+        self.retry_after
+    }
+
     fn deliver<'a>(
         &'a mut self,
         messages: &'a [OutboxMessage],
@@ -143,6 +168,25 @@ fn signature(key: &[u8], id: &str, timestamp_s: &str, body: &[u8]) -> Result<Str
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_pause_is_that_of_seconds_or_of_a_date_and_has_a_limit() {
+        let now = "2026-05-01T12:00:00Z".parse().expect("a time");
+        let pause_s = |text: &str| {
+            let headers = HeaderMap::from_iter([(RETRY_AFTER, text.parse().expect("a header"))]);
+            retry_after(&headers, now).map(|pause| pause.as_secs())
+        };
+        assert_eq!(pause_s("120"), Some(120));
+        assert_eq!(pause_s("Fri, 01 May 2026 12:02:00 GMT"), Some(120));
+        assert_eq!(
+            (pause_s("99999999999"), pause_s("Sat, 01 May 2027 12:00:00 GMT")),
+            (Some(300), Some(300))
+        );
+        for none in ["Fri, 01 May 2026 11:59:00 GMT", "soon", "-1", ""] {
+            assert_eq!(pause_s(none), None, "{none}");
+        }
+        assert_eq!(retry_after(&HeaderMap::new(), now), None);
+    }
 
     /// The example of the Standard Webhooks specification's reference libraries.
     #[test]

@@ -120,7 +120,7 @@ async fn models(config: &Config, clock: &Clock, report: &DatabaseReport) -> Chec
     }
 }
 
-/// Whether old samples are deleted as the settings say.
+/// Checks that old samples are deleted as the settings say.
 async fn retention(config: &Config, clock: &Clock) -> Check {
     const NAME: &str = "retention";
     let days = config.limits.sample_days;

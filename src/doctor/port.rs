@@ -1,4 +1,4 @@
-//! Whether the port is free, or who answers on it.
+//! Check that the port is free, or that a server answers on it.
 
 use std::io::{self, Read as _, Write as _};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener, TcpStream};

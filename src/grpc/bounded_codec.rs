@@ -8,11 +8,11 @@ use tonic::codec::{BufferSettings, Codec, DecodeBuf, Decoder};
 use tonic_prost::{ProstDecoder, ProstEncoder};
 
 use super::message_memory::{Misfit, decoded_bytes};
-use crate::admission::DecodedMemory;
+use crate::request::RequestContext;
 
 /// Shorter messages are decoded at once: what they come to is within what a request counts as (16 KiB), or not much more.
 const SHORT_BYTES: usize = 512;
-/// What the elements of a message may come to in memory, for each of its bytes, bytes.
+/// The largest memory of the elements of a message, for each of its bytes, bytes.
 const MEMORY_PER_BYTE: usize = 8;
 /// The same whatever its length: a batch of a thousand short observations.
 const FREE_MEMORY_BYTES: usize = 512 * 1024;
@@ -80,5 +80,6 @@ fn admit<D: Name>(message: &[u8]) -> Result<(), Status> {
         }
     };
     // Why is known, and reported, where requests are admitted.
-    DecodedMemory::charge(bytes as u64).map_err(|error| Status::resource_exhausted(error.to_string()))
+    RequestContext::charge_decoded(bytes as u64)
+        .map_err(|error| Status::resource_exhausted(error.to_string()))
 }

@@ -1,6 +1,6 @@
 //! `CameraService`.
 
-use super::convert::{camera_id, of_field, recipe, required, site_id, timestamp};
+use super::convert::{camera_id, of_field, position, recipe, required, site_id, timestamp};
 use super::mask::named_fields;
 use super::pages;
 use super::proto;
@@ -109,6 +109,7 @@ impl CameraService for Cameras {
 /// A profile of which everything may be left out.
 fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> {
     let named = NewCamera::named(id);
+    let location = profile.location.map(position).transpose();
     let classes = profile.target_classes.iter().enumerate().map(|(index, class)| {
         TargetClass::new(class).map_err(|error| renamed(error, format!("target_classes[{index}]")))
     });
@@ -118,6 +119,7 @@ fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> 
             .unwrap_or(named.display_name),
         image_size: profile.image_size.map(image_size).transpose()?,
         gnss_error: gnss_error(profile.gnss_error)?,
+        location: location.map_err(|error| error.under("location"))?,
         gnss_bias_sigma: profile.gnss_bias_sigma_m.map(GnssBiasSigma::new).transpose()?,
         recipe: recipe(profile.recipe)?.unwrap_or_default(),
         target_classes: classes.collect::<Result<_>>()?,
@@ -189,6 +191,7 @@ fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
         ("display_name", !profile.display_name.is_empty()),
         ("image_size", profile.image_size.is_some()),
         ("gnss_error", profile.gnss_error.is_some()),
+        ("location", profile.location.is_some()),
         ("gnss_bias_sigma_m", profile.gnss_bias_sigma_m.is_some()),
         ("recipe", profile.recipe != proto::Recipe::Unspecified as i32),
         ("target_classes", !profile.target_classes.is_empty()),
@@ -237,6 +240,7 @@ impl From<NewCamera> for proto::CameraProfile {
             receivers: profile.receivers.iter().map(Into::into).collect(),
             retrain_when_moved: Some(profile.retrain_when_moved),
             learn_automatically: Some(profile.learn_automatically),
+            location: profile.location.map(Into::into),
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
             site: profile.site.map(|site| site.as_str().to_owned()),
         }

@@ -1,8 +1,8 @@
-//! A client of `FusionService.Stream`, without a word of the transport in what it takes and gives.
+//! A client of `FusionService.Stream`, whose interface does not show the transport.
 //!
 //! One [`Connection`] carries many streams. [`Connection::open`] gives the two halves of one: an
 //! [`ItemSender`], whose waiting is the server's backpressure, and the [`Events`] that come back.
-//! Never here: retries, buffers and clocks; the caller decides on those, see
+//! Has no retries, buffers or clocks; the caller decides on those, see
 //! [`crate::replay`].
 
 use std::fmt;
@@ -38,11 +38,11 @@ pub struct Opening {
     pub client_name: String,
     /// The last seq that an earlier stream of this client had acknowledged; 0 to begin.
     pub resume_after_seq: u64,
-    /// Whether the items become training samples and are acknowledged.
+    /// True if the items become training samples and are acknowledged.
     pub store_samples: bool,
 }
 
-/// What the server tells on a stream.
+/// A message of the server on a stream.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Event {
     /// The first: the stream is open.
@@ -53,15 +53,12 @@ pub enum Event {
     /// The answer for one item.
     Answer(Box<proto::StreamAnswer>),
     /// Every item up to this seq is committed or can no longer become a sample.
-    Acknowledged {
-        /// The seq.
-        seq: u64,
-    },
+    Acknowledged { seq: u64 },
     /// The camera no longer looks where it looked when its model was trained.
     CameraMoved(proto::CameraMoved),
     /// Half-close, wait for the last acknowledgement and the end, and open another stream.
     Reconnect {
-        /// For people.
+        /// The reason, for people.
         reason: String,
     },
 }
@@ -71,9 +68,9 @@ pub enum Event {
 pub struct ClientError {
     /// The stable name of the kind of error if the server gave one; else the name of the code.
     pub reason: String,
-    /// For people.
+    /// The error, for people.
     pub message: String,
-    /// Whether the same may go well later: the line broke, or the server has too much to do.
+    /// True if the same may succeed later: the connection broke, or the server is overloaded.
     pub retryable: bool,
     /// Address of the node that does what was asked for, where the server is one of several.
     pub owner: Option<String>,
@@ -159,7 +156,7 @@ impl Connection {
     /// Opens a stream. The first event is [`Event::Opened`].
     ///
     /// # Errors
-    /// What the server or the line says.
+    /// The error that the server or the connection reports.
     pub async fn open(&self, opening: &Opening) -> Result<(ItemSender, Events), ClientError> {
         let (sender, mut queue) = mpsc::channel(ITEMS_QUEUED);
         // The queue is empty and has room, so this cannot fail.
@@ -220,7 +217,7 @@ impl Events {
     /// nothing. Events of a kind that this client does not know yet are passed over.
     ///
     /// # Errors
-    /// What ended the stream otherwise.
+    /// The error that ended the stream otherwise.
     pub async fn next(&mut self) -> Result<Option<Event>, ClientError> {
         use proto::stream_response::Kind;
         loop {

@@ -85,7 +85,7 @@ impl From<domain::Motion> for proto::Motion {
     }
 }
 
-/// What becomes of samples that are stored already.
+/// Reads the rule for samples that are stored already.
 pub(super) fn on_conflict(on_conflict: i32) -> Result<domain::OnConflict> {
     match proto::OnConflict::try_from(on_conflict) {
         Ok(proto::OnConflict::Unspecified | proto::OnConflict::Keep) => Ok(domain::OnConflict::Keep),

@@ -6,7 +6,7 @@ use super::convert::{camera_id, observation, timestamp};
 use super::outbox::Responses;
 use super::proto;
 use super::proto::fusion_service_server::FusionService;
-use super::statuses::{Reply, answer, callers_app, client_id, request_id, to_status};
+use super::statuses::{Reply, answer, context};
 use super::stream;
 use crate::app::App;
 use crate::domain::{Flag, FusedFix, TargetId, convert_all};
@@ -31,10 +31,9 @@ impl FusionService for Fusion {
         &self,
         request: tonic::Request<Streaming<proto::StreamRequest>>,
     ) -> Reply<Self::StreamStream> {
-        let id = request_id(request.extensions());
-        let client = client_id(request.extensions());
-        let app = callers_app(&self.app, request.extensions()).map_err(|error| to_status(&error, &id))?;
-        let responses = stream::serve(&app, &self.shutdown, id, client, request.into_inner());
+        let context = context(request.extensions())?.clone();
+        let app = self.app.on_behalf_of(context.caller().clone());
+        let responses = stream::serve(app, &self.shutdown, context, request.into_inner());
         Ok(tonic::Response::new(responses))
     }
 
@@ -46,7 +45,7 @@ impl FusionService for Fusion {
             let rules = camera.row_rules(app.clock.now());
             let convert = |message| observation(message, &rules);
             let observations = convert_all("observations", asked.observations, convert)?;
-            let fused = app.fuse(camera, &observations).await?;
+            let fused = app.fuse_batch(camera, &observations).await?;
             Ok(proto::FuseResponse { fusions: fused.into_iter().map(Into::into).collect() })
         })
         .await

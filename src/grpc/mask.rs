@@ -2,7 +2,7 @@
 
 use crate::domain::{Error, Result};
 
-/// Whether a change names a field: those of the mask (`*` for all) or, without one, those `present` in the
+/// Says if a change names a field: those of the mask (`*` for all) or, without one, those `present` in the
 /// profile.
 ///
 /// # Errors

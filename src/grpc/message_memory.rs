@@ -1,4 +1,4 @@
-//! What a message comes to in memory when it is decoded, by its wire format and its description, before any of it is
+//! The memory of a decoded message, computed from its wire format and its description before any of it is
 //! built.
 //!
 //! An element of two bytes may be a message of hundreds. Only what a message may have many of is counted; the rest is
@@ -15,7 +15,7 @@ use super::proto;
 
 /// A vector that grows has twice the place of its elements; so have maps.
 const GROWTH: usize = 2;
-/// What the allocator takes for a short text.
+/// The memory that the allocator takes for a short text.
 const SHORT_TEXT_BYTES: usize = 16;
 /// Messages within messages, at most; those of the interface have fewer.
 const MOST_DEPTH: u32 = 32;
@@ -29,7 +29,7 @@ pub(super) enum Misfit {
     TooLarge,
 }
 
-/// What a message of this name comes to besides its own bytes, at least roughly and rather too much.
+/// The memory of a message of this name besides its own bytes; an estimate that is rather too large.
 ///
 /// # Errors
 /// A message that comes to more than `most` bytes, or is not of the wire format.
@@ -41,7 +41,7 @@ pub(super) fn decoded_bytes(name: &str, message: &[u8], most: usize) -> Result<u
 
 /// How the fields of a message are held.
 struct Shape {
-    /// What its struct takes, at most.
+    /// The largest size of its struct.
     bytes: usize,
     /// By their numbers; `None` where all is within the struct.
     fields: Vec<Option<Field>>,
@@ -49,11 +49,11 @@ struct Shape {
 
 #[derive(Clone, Copy)]
 enum Field {
-    /// A text or bytes, each with so many bytes besides its content.
+    /// A text or bytes, each with this number of bytes besides its content.
     Text { header_bytes: usize },
     /// A message, by its place among the shapes, and how many of its structs each one takes besides the message around it.
     Message { shape: usize, structs: usize },
-    /// Many numbers, each of so many bytes in memory and, if that is fixed, on the wire.
+    /// Many numbers, each of this number of bytes in memory and, if that is fixed, on the wire.
     Numbers { bytes: usize, wire_bytes: Option<usize> },
 }
 
@@ -63,7 +63,7 @@ struct Shapes {
 }
 
 static SHAPES: LazyLock<Shapes> = LazyLock::new(|| {
-    // What the build wrote; every start reads it for server reflection, too.
+    // The descriptors that the build wrote; every start reads them for server reflection, too.
     Shapes::of(&FileDescriptorSet::decode(proto::FILE_DESCRIPTOR_SET).unwrap_or_default())
 });
 
@@ -117,12 +117,12 @@ fn is_repeated(field: &FieldDescriptorProto) -> bool {
     field.label() == Label::Repeated
 }
 
-/// Whether the build has a field of a message held by a pointer.
+/// True if the build has a field of a message held by a pointer.
 fn is_boxed(message: &str, field: &FieldDescriptorProto) -> bool {
     env!("BOXED_FIELDS").split(' ').any(|boxed| boxed == format!("{message}.{}", field.name()))
 }
 
-/// What the struct of a message takes, at most; of a oneof every field counts.
+/// The largest size of the struct of a message; of a oneof every field counts.
 fn struct_bytes(
     place: usize,
     described: &[(String, &DescriptorProto)],
@@ -271,7 +271,7 @@ mod tests {
     use crate::grpc::inference_proto;
     use crate::grpc::proto::{ImportSamplesRequest, PairSamplesRequest, Sample};
 
-    /// What a shape says of a message's struct, and what the struct takes.
+    /// The size that a shape states for a message's struct, and the size of the struct.
     fn sizes<M: Name>() -> (usize, usize) {
         let shape = SHAPES.by_name.get(&M::full_name()).expect("it is described");
         (SHAPES.messages[*shape].bytes, size_of::<M>())
@@ -322,7 +322,7 @@ mod tests {
     }
 
     proptest::proptest! {
-        /// What is decoded was counted: only what prost refuses, too, and groups are malformed here.
+        /// Every decoded message was counted: only messages that prost also refuses, and groups, are malformed here.
         #[test]
         fn what_prost_decodes_is_well_formed(message: Vec<u8>) {
             let name = PairSamplesRequest::full_name();

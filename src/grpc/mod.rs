@@ -1,9 +1,9 @@
 //! The gRPC transport of `sightfix.v1` over [`crate::app`]: convert, call the use case, convert.
 //!
-//! Never here: checks on numbers (the constructors of [`crate::domain`] make them), status
+//! Does not contain checks on numbers (the constructors of [`crate::domain`] make them), status
 //! codes other than those of [`crate::status`], and streams that outlive the server's end.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod audit;
@@ -123,7 +123,7 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         .prepare()
 }
 
-/// What a request is for, by its path.
+/// The class of a request, by its path.
 #[must_use]
 pub fn class(path: &str) -> RequestClass {
     match path {

@@ -105,7 +105,7 @@ impl Outbox {
         self.0.put(|waiting| waiting.end = Some(status));
     }
 
-    /// Whether nobody will ever read what is put in.
+    /// True if nobody will ever read what is put in.
     pub(super) fn reader_is_gone(&self) -> bool {
         self.0.lock().reader_gone
     }

@@ -6,7 +6,6 @@ use super::convert::{camera_id, durability, on_conflict, timestamp};
 use super::proto;
 use super::proto::pair_samples_request::Kind;
 use super::statuses::broken;
-use crate::admission::{BodyRefusal, ClientId};
 use crate::app::{
     App, ImportOptions, MatchReport, PairedImport, PairedReport, PairingCounts, Part, Spool, Spooled,
 };
@@ -18,12 +17,13 @@ use crate::exchange::{BoxForm, BoxUnit, CsvLayout, FixFormat, Format, RowError};
 use crate::fusion::association::MatchSettings;
 use crate::fusion::clock_offset::OffsetEstimate;
 use crate::fusion::pairing::{PairingRule, PairingSettings};
+use crate::request::RequestContext;
 use crate::shutdown::Shutdown;
 
 /// The messages of an import of two files.
 pub(super) struct Pieces {
     pub(super) messages: Streaming<proto::PairSamplesRequest>,
-    pub(super) refusal: BodyRefusal,
+    pub(super) context: RequestContext,
     pub(super) shutdown: Shutdown,
 }
 
@@ -37,7 +37,7 @@ impl Pieces {
                 "the server is ending; send the files again, nothing of them was stored",
             )),
             message = self.messages.message() => {
-                message.map_err(|status| self.refusal.get().unwrap_or_else(|| broken(&status)))
+                message.map_err(|status| self.context.body_refusal().unwrap_or_else(|| broken(&status)))
             }
         };
         let missing = || Error::invalid("kind", "must be the opening or a piece of a file");
@@ -45,8 +45,9 @@ impl Pieces {
     }
 
     /// Both files whole, of at most as many bytes together as the body of a REST import.
-    async fn spool(&mut self, app: &App, client: ClientId) -> Result<[Spooled; 2]> {
+    async fn spool(&mut self, app: &App) -> Result<[Spooled; 2]> {
         let limit = app.limits.import_bytes;
+        let client = self.context.client();
         let mut detections = Spool::new(app, client)?;
         let mut fixes = Spool::new(app, client)?;
         while let Some(kind) = self.next().await? {
@@ -69,7 +70,6 @@ impl Pieces {
 pub(super) async fn pair(
     app: &App,
     mut pieces: Pieces,
-    client: ClientId,
     idempotent: Option<IdempotentRequest>,
 ) -> Result<proto::PairSamplesResponse> {
     let Some(Kind::Opening(opening)) = pieces.next().await? else {
@@ -87,7 +87,7 @@ pub(super) async fn pair(
     let (detections_format, fixes_format) =
         (detection_format(opening.detections_format)?, fix_format(opening.fixes_format)?);
     app.row_rules(&camera).await?; // refuses an unknown camera before its samples are sent
-    let [mut detections, mut fixes] = pieces.spool(app, client).await?;
+    let [mut detections, mut fixes] = pieces.spool(app).await?;
     if let Some(request) = &idempotent {
         request.hasher.update(&prost::Message::encode_to_vec(&opening));
         detections = detections.hash_into(request).await?;
@@ -125,6 +125,7 @@ fn fix_format(format: i32) -> Result<FixFormat> {
         Ok(proto::FixFormat::Nmea) => Ok(FixFormat::Nmea),
         Ok(proto::FixFormat::Gpx) => Ok(FixFormat::Gpx),
         Ok(proto::FixFormat::Gpsd) => Ok(FixFormat::Gpsd),
+        Ok(proto::FixFormat::Rtklib) => Ok(FixFormat::Rtklib),
         Err(_) => Err(unknown("fixes_format", format)),
     }
 }

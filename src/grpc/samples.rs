@@ -10,11 +10,11 @@ use super::pages;
 use super::pairings::{Pieces, pair};
 use super::proto;
 use super::proto::sample_service_server::SampleService;
-use super::statuses::{Reply, answer, broken, client_id};
-use crate::admission::BodyRefusal;
+use super::statuses::{Reply, answer, broken, context};
 use crate::app::{App, ImportOptions, ImportReport, RejectedRow};
 use crate::domain::{Durability, Error, ErrorKind, RequestHasher, Result, SampleCount, StoredSample};
 use crate::exchange::RowRules;
+use crate::request::RequestContext;
 use crate::shutdown::Shutdown;
 use crate::store::{SampleFilter, SampleKey};
 
@@ -35,11 +35,11 @@ impl SampleService for Samples {
         &self,
         request: tonic::Request<Streaming<proto::ImportSamplesRequest>>,
     ) -> Reply<proto::ImportSamplesResponse> {
-        let refusal = request.extensions().get().cloned().unwrap_or_default();
+        let context = context(request.extensions())?.clone();
         let idempotent = idempotent(&request, "ImportSamples");
         answer(&self.app, request, |app, messages| async move {
             let shutdown = self.shutdown.clone();
-            let mut batches = Batches { messages, refusal, shutdown, camera: String::new() };
+            let mut batches = Batches { messages, context, shutdown, camera: String::new() };
             let Some(first) = batches.next().await? else {
                 return Err(Error::invalid("camera_id", "is required in the first message"));
             };
@@ -67,12 +67,11 @@ impl SampleService for Samples {
         &self,
         request: tonic::Request<Streaming<proto::PairSamplesRequest>>,
     ) -> Reply<proto::PairSamplesResponse> {
-        let refusal = request.extensions().get().cloned().unwrap_or_default();
-        let client = client_id(request.extensions());
+        let context = context(request.extensions())?.clone();
         let idempotent = idempotent(&request, "PairSamples");
         answer(&self.app, request, |app, messages| async move {
-            let pieces = Pieces { messages, refusal, shutdown: self.shutdown.clone() };
-            pair(&app, pieces, client, idempotent?).await
+            let pieces = Pieces { messages, context, shutdown: self.shutdown.clone() };
+            pair(&app, pieces, idempotent?).await
         })
         .await
     }
@@ -131,7 +130,7 @@ impl SampleService for Samples {
 /// The messages of an import, one at a time.
 struct Batches {
     messages: Streaming<proto::ImportSamplesRequest>,
-    refusal: BodyRefusal,
+    context: RequestContext,
     shutdown: Shutdown,
     /// As the first message names it.
     camera: String,
@@ -147,7 +146,7 @@ impl Batches {
                 "the server is ending; send the samples again, those that are stored count as duplicates",
             )),
             message = self.messages.message() => {
-                message.map_err(|status| self.refusal.get().unwrap_or_else(|| broken(&status)))
+                message.map_err(|status| self.context.body_refusal().unwrap_or_else(|| broken(&status)))
             }
         }
     }

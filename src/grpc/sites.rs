@@ -8,7 +8,7 @@ use super::mask::named_fields;
 use super::pages;
 use super::proto;
 use super::proto::site_service_server::SiteService;
-use super::statuses::{Reply, answer, client_id, request_id};
+use super::statuses::{Reply, answer, context};
 use super::world_tracks::{Events, events, live_id};
 use crate::app::{App, SiteRunRequest};
 use crate::domain::{NewSite, Result, Revision, RunId, Site, SiteChange, SiteId};
@@ -183,8 +183,8 @@ impl SiteService for Sites {
     type WatchTracksStream = Events;
 
     async fn watch_tracks(&self, request: tonic::Request<proto::WatchTracksRequest>) -> Reply<Events> {
-        let id = request_id(request.extensions());
-        let client = client_id(request.extensions());
+        let context = context(request.extensions())?;
+        let (id, client) = (context.id().clone(), context.client());
         answer(&self.app, request, |app, asked| async move {
             let lease = app.quotas.event_streams.try_acquire(client, 1)?;
             let site = site_id(&asked.site_id)?;

@@ -9,10 +9,9 @@ use hyper::{HeaderMap, Response};
 use tonic::{Code, Request, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt as _};
 
-use crate::admission::ClientId;
 use crate::app::App;
-use crate::app::access::Caller;
 use crate::domain::{Error, ErrorKind, Refusal, Result, Violation};
+use crate::request::RequestContext;
 use crate::status;
 use crate::telemetry::RequestId;
 
@@ -25,7 +24,7 @@ const LONGEST_TEXT: usize = 400;
 /// The same for each text about a field at fault.
 const LONGEST_VIOLATION_TEXT: usize = 160;
 
-/// What a unary method gives.
+/// The result of a unary method.
 pub(super) type Reply<T> = std::result::Result<tonic::Response<T>, Status>;
 
 /// Answers a unary request by a use case, which gets the application on behalf of the caller.
@@ -38,24 +37,20 @@ where
     F: Future<Output = Result<R>>,
 {
     let (_, extensions, message) = request.into_parts();
-    let answered = match callers_app(app, &extensions) {
-        Ok(app) => handle(app, message).await,
-        Err(error) => Err(error),
-    };
-    match answered {
+    let context = context(&extensions)?;
+    match handle(app.on_behalf_of(context.caller().clone()), message).await {
         Ok(reply) => Ok(tonic::Response::new(reply)),
-        Err(error) => Err(to_status(&error, &request_id(&extensions))),
+        Err(error) => Err(to_status(&error, context.id())),
     }
 }
 
-/// The application on behalf of the request's caller.
+/// Returns the context of the request.
 ///
 /// # Errors
-/// A fault for a request that did not come through the server's pipeline.
-pub(super) fn callers_app(app: &App, extensions: &Extensions) -> Result<App> {
-    let caller =
-        extensions.get::<Caller>().ok_or_else(|| Error::fault("a request came without its caller"))?;
-    Ok(app.on_behalf_of(caller.clone()))
+/// `INTERNAL` for a request that did not come through the server's layers.
+pub(super) fn context(extensions: &Extensions) -> std::result::Result<&RequestContext, Status> {
+    let unknown = || RequestId::new(HeaderValue::from_static("unknown"));
+    RequestContext::of(extensions).map_err(|error| to_status(&error, &unknown()))
 }
 
 /// An error as the last frame of a response.
@@ -65,17 +60,6 @@ pub fn trailers(error: &Error, id: &RequestId) -> HeaderMap {
     // All of it was made here from text, so it fits into headers.
     let _ = to_status(error, id).add_header(&mut trailers);
     trailers
-}
-
-/// The id that the pipeline assigned to the request.
-pub(super) fn request_id(extensions: &Extensions) -> RequestId {
-    let unknown = || RequestId::new(HeaderValue::from_static("unknown"));
-    extensions.get().cloned().unwrap_or_else(unknown)
-}
-
-/// Who sends the request.
-pub(super) fn client_id(extensions: &Extensions) -> ClientId {
-    extensions.get().copied().unwrap_or(ClientId::UNKNOWN)
 }
 
 /// An error with its code and details: `ErrorInfo` with the problem's slug as reason (and as `owner` in its metadata the

@@ -12,13 +12,12 @@ use super::proto;
 use super::proto::stream_answer::Outcome;
 use super::proto::stream_request::Kind;
 use super::statuses::{broken, to_status};
-use crate::admission::ClientId;
 use crate::app::{Acknowledgement, App, ItemResult, LiveStream, NotStored, NotStoredReason, TrackPoint};
 use crate::domain::{CameraMoved, Error, ErrorKind, Flag, Result};
 use crate::fusion::track::{MeasurementSource, Rejection, RejectionReason};
+use crate::request::RequestContext;
 use crate::shutdown::Shutdown;
 use crate::status;
-use crate::telemetry::RequestId;
 
 /// How often age, idle time and the reader are checked.
 const TICK: Duration = Duration::from_secs(1);
@@ -29,18 +28,16 @@ const BATCH: u32 = 32;
 
 /// Begins to answer a stream; all errors come as its end.
 pub(super) fn serve(
-    app: &App,
+    app: App,
     shutdown: &Shutdown,
-    id: RequestId,
-    client_id: ClientId,
+    context: RequestContext,
     requests: Streaming<proto::StreamRequest>,
 ) -> Responses {
     let (outbox, responses) = outbox(app.limits.live_answers);
-    let mut session =
-        StreamSession { app: app.clone(), shutdown: shutdown.clone(), client_id, requests, outbox };
+    let mut session = StreamSession { app, shutdown: shutdown.clone(), context, requests, outbox };
     shutdown.spawn(async move {
         let ended = session.run().await;
-        let status = ended.err().map(|error| to_status(&error, &id));
+        let status = ended.err().map(|error| to_status(&error, session.context.id()));
         session.outbox.end(status);
     });
     responses
@@ -49,7 +46,7 @@ pub(super) fn serve(
 struct StreamSession {
     app: App,
     shutdown: Shutdown,
-    client_id: ClientId,
+    context: RequestContext,
     requests: Streaming<proto::StreamRequest>,
     outbox: Outbox,
 }
@@ -99,7 +96,7 @@ impl StreamSession {
             error = stream.ended() => Err(error),
             () = self.shutdown.forced() => Err(ending()),
         };
-        // What is settled is acknowledged even where the rest could not be.
+        // Settled items are acknowledged even where the rest could not be.
         if let Ok(Some(acknowledgement)) = stream.acknowledgement() {
             self.outbox.acknowledge(acknowledgement.into());
         }
@@ -130,7 +127,7 @@ impl StreamSession {
             .open_stream(
                 &camera,
                 &opening.client_name,
-                self.client_id,
+                self.context.client(),
                 opening.resume_after_seq,
                 store_samples,
             )
@@ -264,7 +261,7 @@ impl StreamSession {
         match answered {
             Ok(item) => Ok(answer_of(seq, item)),
             Err(Error::Refused(refusal)) if !ends_stream(refusal.kind) => {
-                // What was recorded before the refusal is acknowledged with its commit.
+                // Items recorded before the refusal are acknowledged with their commit.
                 stream.acknowledgement()?;
                 stream.ack_refused(seq);
                 Ok(refused(seq, &Error::Refused(refusal)))
@@ -274,7 +271,7 @@ impl StreamSession {
     }
 }
 
-/// Whether a refusal is of the whole stream, not of an item.
+/// True if a refusal is of the whole stream, not of an item.
 const fn ends_stream(kind: ErrorKind) -> bool {
     matches!(kind, ErrorKind::CameraNotFound | ErrorKind::CameraOnOtherNode | ErrorKind::CameraBetweenNodes)
 }

@@ -5,14 +5,14 @@ use std::pin::Pin;
 use futures_util::{Stream, StreamExt as _, stream};
 use tonic::Status;
 
-use super::convert::camera_id;
+use super::convert::{camera_id, timestamp};
 use super::proto;
 use super::proto::track_service_server::TrackService;
 use super::proto::watch_camera_response::Event;
-use super::statuses::{Reply, answer, client_id, request_id, to_status};
+use super::statuses::{Reply, answer, context, to_status};
 use crate::admission::Lease;
-use crate::app::{App, CameraEvent, CameraEvents, EventId, LostEvents, TargetUpdate};
-use crate::domain::{CameraId, Error, ErrorKind, TargetId};
+use crate::app::{App, CameraEvent, CameraEvents, EventId, LostEvents, TargetUpdate, UnplacedBox};
+use crate::domain::{CameraId, Error, ErrorKind, Score, TargetId};
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
@@ -59,12 +59,12 @@ impl TrackService for Tracks {
     type WatchCameraStream = Events;
 
     async fn watch_camera(&self, request: tonic::Request<proto::WatchCameraRequest>) -> Reply<Events> {
-        let id = request_id(request.extensions());
-        let client = client_id(request.extensions());
+        let context = context(request.extensions())?;
+        let (id, client) = (context.id().clone(), context.client());
         answer(&self.app, request, |app, asked| async move {
             let lease = app.quotas.event_streams.try_acquire(client, 1)?;
             let camera = camera_id(&asked.camera_id)?;
-            // What is no id of ours names no event that is known.
+            // A text that is no id of ours names no known event.
             let after = Some(asked.resume_after.as_str())
                 .filter(|text| !text.is_empty())
                 .map(|text| text.parse().unwrap_or(EventId::UNKNOWN));
@@ -123,6 +123,7 @@ impl From<&CameraEvent> for Event {
     fn from(event: &CameraEvent) -> Self {
         match event {
             CameraEvent::Track(update) => Self::Track(update.as_ref().into()),
+            CameraEvent::Box(seen) => Self::Box(seen.as_ref().into()),
             CameraEvent::Moved(moved) => Self::CameraMoved(moved.as_ref().clone().into()),
         }
     }
@@ -134,6 +135,19 @@ impl From<&TargetUpdate> for proto::CameraTrackUpdate {
             track: Some(update.point.as_ref().into()),
             bounding_box: update.bounding_box.map(Into::into),
             fused: update.fused.clone().map(Into::into),
+        }
+    }
+}
+
+impl From<&UnplacedBox> for proto::CameraBox {
+    fn from(seen: &UnplacedBox) -> Self {
+        Self {
+            time: Some(timestamp(seen.time)),
+            target_id: seen.target_id.as_ref().map(|id| id.as_str().to_owned()),
+            tracker_id: seen.tracker_id.as_ref().map(|id| id.as_str().to_owned()),
+            bounding_box: Some(seen.bounding_box.into()),
+            class: seen.class.as_ref().map(|class| class.as_str().to_owned()),
+            score: seen.score.map(Score::value),
         }
     }
 }

@@ -11,7 +11,7 @@ use super::idempotency::idempotent;
 use super::pages;
 use super::proto;
 use super::proto::training_service_server::TrainingService;
-use super::statuses::{Reply, answer, client_id, request_id, to_status};
+use super::statuses::{Reply, answer, context, to_status};
 use crate::admission::Lease;
 use crate::app::{App, RunRequest};
 use crate::domain::{
@@ -112,8 +112,8 @@ impl TrainingService for Training {
         &self,
         request: tonic::Request<proto::WatchTrainingRunRequest>,
     ) -> Reply<Changes> {
-        let id = request_id(request.extensions());
-        let client = client_id(request.extensions());
+        let context = context(request.extensions())?;
+        let (id, client) = (context.id().clone(), context.client());
         answer(&self.app, request, |app, asked| async move {
             let lease = app.quotas.event_streams.try_acquire(client, 1)?;
             let (camera, run) = (camera_id(&asked.camera_id)?, run_id(&asked.run_id)?);

@@ -11,7 +11,7 @@ use super::proto::watch_tracks_response::Event;
 use super::statuses::to_status;
 use crate::admission::Lease;
 use crate::app::{LossReason, LostSiteEvents, SiteEventKind, SiteEvents, StoredSiteEvent, WorldTrackPoint};
-use crate::domain::{Error, ErrorKind, SiteId, TargetId};
+use crate::domain::{Error, ErrorKind, SiteId};
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
@@ -19,7 +19,7 @@ use crate::telemetry::RequestId;
 pub(super) mod live_id {
     use crate::domain::{Error, ErrorKind, LiveId, Result};
 
-    /// What is no id of a track names none that there is.
+    /// A text that is no id of a track names a track that does not exist.
     pub(in crate::grpc) fn of_track(text: &str) -> Result<LiveId> {
         text.parse().map_err(|_: Error| {
             Error::refused(ErrorKind::TrackNotFound, "that is not the id of a world track")
@@ -139,7 +139,7 @@ impl From<&WorldTrackPoint> for proto::WorldTrackPoint {
                 .iter()
                 .map(|sighting| proto::WorldSighting {
                     camera_id: sighting.camera_id.to_string(),
-                    tracker_id: sighting.tracker_id.as_ref().map(TargetId::to_string),
+                    tracker_id: sighting.tracker_id.as_ref().map(|id| id.as_sent().to_owned()),
                     last_seen_at: Some(timestamp(sighting.last_seen_at)),
                 })
                 .collect(),

@@ -1,59 +1,18 @@
 //! The REST transport over [`crate::app`]: routes, conversion of JSON, problems, OpenAPI.
 //!
-//! Route and description are declared together, a file per resource. Never here:
-//! gRPC, SQL, statuses chosen by hand (they come from [`crate::status`]), numbers checked (that is
-//! done by the constructors of [`crate::domain`]), a body without a limit.
+//! `resources` has a file per resource, with route and description together, `plumbing` the parts that they share. Does not contain gRPC, SQL, statuses chosen by
+//! hand (they come from [`crate::status`]), checks on numbers (the constructors of [`crate::domain`] make them), or
+//! a body without a limit.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
-mod access;
-mod audit;
-mod body;
-mod body_coding;
-mod body_error;
-mod camera_statuses;
-mod cameras;
-mod connections;
-mod console;
-mod description;
-mod etag;
-mod evaluations;
-mod extract;
-mod features;
-mod fusions;
-mod gnss_error;
-mod idempotency;
-mod inference;
-mod keys;
-mod learning;
-mod merge_patch;
-mod models;
-mod moving_features;
-mod nodes;
-mod openid;
-mod pairings;
-mod parts;
-mod pictures;
-mod problem;
-mod receivers;
-mod samples;
-mod server_info;
-mod service;
-mod session;
-mod site_training_runs;
-mod sites;
+mod plumbing;
+mod resources;
 #[cfg(test)]
 mod tests;
-mod tiles;
-mod tracks;
-mod training_runs;
-mod wire;
-mod world_tracks;
 
-use std::borrow::Cow;
 use std::panic::AssertUnwindSafe;
-use std::sync::Arc;
 
 use axum::Router;
 use axum::body::Body;
@@ -78,15 +37,11 @@ use crate::domain::Error;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
-pub use session::session_token;
+use plumbing::state::Rest;
+use plumbing::{access, body_coding, description, problem};
 
-/// What the handlers share.
-#[derive(Clone)]
-struct Rest {
-    app: App,
-    console: Arc<Console>,
-    shutdown: Shutdown,
-}
+pub use plumbing::path_key::{path_key, shown_path};
+pub use resources::session_token;
 
 /// All REST routes, the description at `/openapi.json` and its page at `/docs`, the operator's console at `/`.
 #[derive(Clone)]
@@ -96,8 +51,8 @@ impl Transport {
     /// The transport over an application.
     #[must_use]
     pub fn new(app: App, console: Console, shutdown: Shutdown) -> Self {
-        let console_routes = console::routes(&console);
-        let rest = Rest { app, console: Arc::new(console), shutdown };
+        let pages = resources::pages(&console);
+        let rest = Rest::new(app, console, shutdown);
         let (routes, described) = described().split_for_parts();
         let authorize = access::AuthorizeLayer::of(&described);
         // The page would otherwise ask a server on the internet whether the description is well formed.
@@ -105,26 +60,19 @@ impl Transport {
             .url("/openapi.json", described)
             .config(Config::default().validator_url("none").use_base_layout());
         let page = Router::from(page).layer(map_response(contain_page));
-        Self(
-            routes
-                .route_layer(authorize)
-                .merge(page)
-                .merge(console_routes)
-                .merge(openid::callback())
-                .with_state(rest),
-        )
+        Self(routes.route_layer(authorize).merge(page).merge(pages).with_state(rest))
     }
 
     /// Probes and metrics alone, for the listener of the setting `metrics_listen`.
     #[must_use]
     pub fn monitoring(app: App, shutdown: Shutdown) -> Self {
-        let rest = Rest { app, console: Arc::default(), shutdown };
-        let (routes, described) = service::routes().split_for_parts();
+        let rest = Rest::new(app, Console::default(), shutdown);
+        let (routes, described) = resources::monitoring().split_for_parts();
         Self(routes.route_layer(access::AuthorizeLayer::of(&described)).with_state(rest))
     }
 
-    /// Answers a request, which carries its [`RequestId`] and its [`Caller`](crate::app::access::Caller) as
-    /// extensions. Whatever part of the router refuses it, or panics, the answer is a problem.
+    /// Answers a request, which carries its [`RequestContext`](crate::request::RequestContext) as an extension.
+    /// Whatever part of the router refuses it, or panics, the answer is a problem.
     pub async fn answer(&self, request: Request<Body>) -> Response<Body> {
         // Not as layers of the router: axum would box the service and the future of every request for each.
         let coding = body_coding::AcceptedCoding::of(&request);
@@ -136,7 +84,7 @@ impl Transport {
     }
 }
 
-/// What the page of the description may do: run its own scripts and ask its own server, nothing else.
+/// The content security policy of the description's page: it runs its own scripts and asks its own server only.
 /// Swagger UI sets styles by attribute and shows images that it holds itself.
 const DESCRIPTION_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; \
      img-src 'self' data:; font-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; \
@@ -174,7 +122,7 @@ async fn named(response: Response) -> Response {
 const LIBRARY_TITLE: &str = "<title>Swagger UI</title>";
 const TITLE: &str = "<title>sightfix: REST interface</title>";
 
-/// What a request is for, by its method and path.
+/// The class of a request, by its method and path.
 #[must_use]
 pub fn class(method: &Method, path: &str) -> RequestClass {
     let last = path.rsplit('/').next().unwrap_or_default();
@@ -198,23 +146,6 @@ pub fn class(method: &Method, path: &str) -> RequestClass {
     }
 }
 
-/// The key at the end of a path, of clients that cannot set headers: `/v1/connections/{connection}/messages/{key}`.
-#[must_use]
-pub fn path_key(path: &str) -> Option<&str> {
-    let (messages, key) = path.rsplit_once('/')?;
-    let connection = messages.strip_prefix("/v1/connections/")?.strip_suffix("/messages")?;
-    (!connection.contains('/') && !key.is_empty()).then_some(key)
-}
-
-/// A path as it may be shown: without its key.
-#[must_use]
-pub fn shown_path(path: &str) -> Cow<'_, str> {
-    match path_key(path).and_then(|key| path.strip_suffix(key)) {
-        Some(before) => format!("{before}{{key}}").into(),
-        None => path.into(),
-    }
-}
-
 /// The description of the REST interface, by OpenAPI 3.1.
 #[must_use]
 pub fn openapi() -> OpenApi {
@@ -228,33 +159,7 @@ pub fn refusal(error: &Error, id: &RequestId) -> Response<Body> {
 }
 
 fn described() -> OpenApiRouter<Rest> {
-    let mut router = OpenApiRouter::with_openapi(description::head())
-        .merge(cameras::routes())
-        .merge(camera_statuses::routes())
-        .merge(pictures::routes())
-        .merge(sites::routes())
-        .merge(site_training_runs::routes())
-        .merge(world_tracks::routes())
-        .merge(connections::routes())
-        .merge(samples::routes())
-        .merge(pairings::routes())
-        .merge(training_runs::routes())
-        .merge(models::routes())
-        .merge(fusions::routes())
-        .merge(tracks::routes())
-        .merge(gnss_error::routes())
-        .merge(evaluations::routes())
-        .merge(inference::routes())
-        .merge(features::routes())
-        .merge(keys::routes())
-        .merge(learning::routes())
-        .merge(audit::routes())
-        .merge(session::routes())
-        .merge(openid::routes())
-        .merge(nodes::routes())
-        .merge(server_info::routes())
-        .merge(tiles::routes())
-        .merge(service::routes());
+    let mut router = OpenApiRouter::with_openapi(description::head()).merge(resources::routes());
     description::add_problems(router.get_openapi_mut());
     description::add_security(router.get_openapi_mut());
     router

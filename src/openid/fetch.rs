@@ -23,7 +23,7 @@ const TIME: Duration = Duration::from_secs(10);
 /// Bytes of an answer.
 const MAX_BYTES: usize = 1 << 20;
 
-/// What the provider answers.
+/// The response of the provider.
 pub(super) struct Answer {
     status: StatusCode,
     body: Bytes,

@@ -80,7 +80,7 @@ enum Audience {
     Several(Vec<String>),
 }
 
-/// What a token must be for.
+/// The values that a token must contain.
 pub(super) struct Expected<'e> {
     pub(super) issuer: &'e str,
     pub(super) client_id: &'e str,
@@ -196,7 +196,7 @@ mod tests {
         json!({ "kty": "RSA", "n": MODULUS, "e": "AQAB", "kid": "1", "use": "sig", "alg": "RS256" })
     }
 
-    /// What is wrong with a token, if anything, this long after it was issued.
+    /// The fault of a token, if any, this long after it was issued.
     fn fault(token: &str, keys: &KeySet, nonce: &str, after_s: i64) -> Option<&'static str> {
         let now = Timestamp::from_second(ISSUED_AT_S + after_s).expect("in range");
         let expected = Expected { issuer: "https://issuer.example", client_id: "sightfix", nonce, now };

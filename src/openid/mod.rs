@@ -3,7 +3,7 @@
 //!
 //! [`Provider::authorization_url`] sends the browser to the provider, [`Provider::identity`] redeems the code that it
 //! comes back with. Nothing is stored in between: state, nonce and PKCE verifier are derived from one random
-//! [`SignInSecret`], which the browser keeps in a cookie. Never here: sessions, HTTP of our own clients.
+//! [`SignInSecret`], which the browser keeps in a cookie. Does not contain sessions, nor HTTP of our own clients.
 
 mod fetch;
 mod id_token;
@@ -30,7 +30,7 @@ const DISCOVERY_TIME: SignedDuration = SignedDuration::from_mins(10);
 /// Longest name of a person that is stored, in bytes.
 const MAX_NAME_BYTES: usize = 128;
 
-/// What binds the two halves of a sign-in to one browser.
+/// The secret that binds the two halves of a sign-in to one browser.
 pub struct SignInSecret(String);
 
 impl SignInSecret {
@@ -79,11 +79,11 @@ pub struct Identity {
     pub name: String,
     /// The provider's address and its id of the person, who keeps it when names change.
     pub subject: String,
-    /// What they may do.
+    /// The scope of the user.
     pub scope: Scope,
 }
 
-/// What the provider says of itself (OpenID Connect Discovery 1.0).
+/// The provider's own description (OpenID Connect Discovery 1.0).
 #[derive(Clone, Deserialize)]
 struct Discovery {
     issuer: String,
@@ -137,7 +137,7 @@ impl Provider {
         }))
     }
 
-    /// Whether browsers reach this server by HTTPS, so that its cookies are for HTTPS alone.
+    /// True if browsers reach this server by HTTPS, so that its cookies are for HTTPS alone.
     #[must_use]
     pub fn is_https(&self) -> bool {
         self.redirect_url.starts_with("https://")
@@ -167,7 +167,7 @@ impl Provider {
     /// Who has signed in, by the code that the provider gave the browser.
     ///
     /// # Errors
-    /// `Unauthenticated` for a state of another browser, or a code or token that does not hold;
+    /// `Unauthenticated` for a state of another browser, or a code or token that is not valid;
     /// `PermissionDenied` for a person without a role; `SignInUnavailable`.
     pub async fn identity(
         &self,
@@ -185,8 +185,8 @@ impl Provider {
         let nonce = secret.nonce();
         let expected = Expected { issuer: &self.issuer, client_id: &self.client_id, nonce: &nonce, now };
         let claims = id_token::verify(&token, &keys, &expected).map_err(|reason| {
-            tracing::warn!(reason, "the OpenID provider sent an ID token that does not hold");
-            not_signed_in("the provider's ID token does not hold; the log says why")
+            tracing::warn!(reason, "the OpenID provider sent an ID token that is not valid");
+            not_signed_in("the provider's ID token is not valid; the log says why")
         })?;
         let name = display_name(&claims);
         let Some(role) = self.role_of(&claims) else {
@@ -261,7 +261,7 @@ impl Provider {
         (authorization, form.finish())
     }
 
-    /// What the provider has answered. Why it has not is for the log alone.
+    /// Returns the provider's answer. The reason of a failure is for the log alone.
     fn provided<T>(&self, answer: anyhow::Result<T>) -> Result<T> {
         answer.map_err(|error| {
             let error = format!("{error:#}");

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 /// Shares of items affected by each fault, 0 to 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FaultShares {
-    /// Not sent.
+    /// Share of items that are not sent.
     pub lose: f64,
     /// Sent a second time, some items later, as an item of its own.
     pub duplicate: f64,
@@ -17,7 +17,6 @@ pub struct FaultShares {
 }
 
 impl FaultShares {
-    /// No faults.
     pub const NONE: Self = Self { lose: 0.0, duplicate: 0.0, reorder: 0.0, max_delay: 3 };
 }
 

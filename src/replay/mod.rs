@@ -5,7 +5,7 @@
 //! are due and holds them in its [`ResendBuffer`] until they are done; after a failure it waits
 //! ([`Backoff`]), opens another stream, at the node that the server names if it names one, and resumes after the
 //! last acknowledgement.
-//! Never here: files, flags, unbounded memory, randomness without a seed.
+//! Does not use files, flags, unbounded memory or randomness without a seed.
 
 mod fault_injection;
 mod latency_histogram;

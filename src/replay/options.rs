@@ -35,7 +35,7 @@ pub struct ReplayOptions {
     pub in_flight: usize,
     /// Capacity of the resend buffer per camera; while it is full no new item is sent.
     pub resend_buffer: usize,
-    /// Whether the server stores the items as training samples and must acknowledge them.
+    /// True if the server stores the items as training samples and must acknowledge them.
     pub store_samples: bool,
     /// Faults injected before items are sent.
     pub faults: FaultShares,

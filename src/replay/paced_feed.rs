@@ -146,7 +146,7 @@ impl PacedFeed {
         Some(item)
     }
 
-    /// Whether items have due times.
+    /// True if items have due times.
     pub(super) fn is_paced(&self) -> bool {
         self.pace != Pace::Unpaced
     }

@@ -10,7 +10,6 @@ pub struct Counters {
     pub items: AtomicU64,
     /// Items answered, each counted once.
     pub answered: AtomicU64,
-    /// Open streams.
     pub streams: AtomicU64,
     /// Why the latest stream broke, or could not be opened; `None` while streams are open.
     fault: Mutex<Option<String>>,

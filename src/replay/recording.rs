@@ -3,12 +3,10 @@
 use jiff::{SignedDuration, Timestamp};
 
 use crate::domain::{Error, LiveItem, ReceiverId, Result, TargetId};
-use crate::exchange::ObservedRow;
 
 /// The owner of fixes that name no target.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum FixOwner {
-    /// A target.
     Target(TargetId),
     /// A receiver; the server knows its target.
     Receiver(ReceiverId),
@@ -28,21 +26,21 @@ impl RecordedStream {
     ///
     /// # Errors
     /// Refuses an empty recording.
-    pub fn from_rows(rows: impl IntoIterator<Item = ObservedRow>) -> Result<Self> {
-        Self::from_items(rows.into_iter().map(item).collect())
+    pub fn from_rows(rows: impl IntoIterator<Item = LiveItem>) -> Result<Self> {
+        Self::from_items(rows.into_iter().collect())
     }
 
-    /// Boxes and fixes that were recorded separately, merged by time. Fixes that name no target belong
+    /// Boxes and fixes that were recorded separately, merged by time. Fixes that name neither target nor receiver belong
     /// to `fix_owner`, or to the only target among the boxes.
     ///
     /// # Errors
     /// Refuses an empty recording, and fixes that may belong to several targets; the field is `target_id`.
     pub fn from_detections_and_fixes(
-        detections: impl IntoIterator<Item = ObservedRow>,
-        fixes: impl IntoIterator<Item = ObservedRow>,
+        detections: impl IntoIterator<Item = LiveItem>,
+        fixes: impl IntoIterator<Item = LiveItem>,
         fix_owner: Option<FixOwner>,
     ) -> Result<Self> {
-        let mut items: Vec<_> = detections.into_iter().map(item).collect();
+        let mut items: Vec<LiveItem> = detections.into_iter().collect();
         let mut targets: Vec<_> = items.iter().filter_map(|item| item.target_id.clone()).collect();
         targets.sort_unstable();
         targets.dedup();
@@ -50,14 +48,14 @@ impl RecordedStream {
             [only] => Some(FixOwner::Target(only.clone())),
             _ => None,
         });
-        for fix in fixes {
-            let mut item = item(fix);
+        for mut item in fixes {
             match (&item.target_id, &fix_owner) {
+                _ if item.receiver_id.is_some() => {}
                 (Some(_), _) => {}
                 (None, Some(FixOwner::Target(id))) => item.target_id = Some(id.clone()),
                 (None, Some(FixOwner::Receiver(id))) => item.receiver_id = Some(id.clone()),
                 (None, None) => {
-                    let message = "the fixes name no target and there are several: name the target or the receiver of the fixes";
+                    let message = "the fixes name neither target nor receiver and there are several targets: name the target or the receiver of the fixes";
                     return Err(Error::invalid("target_id", message));
                 }
             }
@@ -128,23 +126,17 @@ impl RecordedStream {
     }
 }
 
-fn item(row: ObservedRow) -> LiveItem {
-    let ObservedRow { observation, class, score, truth: _ } = row;
-    let (time, target_id, bounding_box, fix) = observation.into_parts();
-    LiveItem { time, target_id, tracker_id: None, receiver_id: None, bounding_box, fix, class, score }
-}
-
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::exchange::{Format, RowRules, read_observations};
+    use crate::exchange::{Format, RowRules, read_live_items};
 
     const BEGIN_S: f64 = 1_700_000_000.0;
 
-    pub(in crate::replay) fn rows(csv: &str) -> Vec<ObservedRow> {
+    pub(in crate::replay) fn rows(csv: &str) -> Vec<LiveItem> {
         let now = "2027-01-01T00:00:00Z".parse().expect("a time");
         let rules = RowRules { time_bounds: crate::domain::TimeBounds::at(now), image_size: None };
-        let rows = read_observations(csv.as_bytes(), Format::Csv, &rules).expect("a header");
+        let rows = read_live_items(csv.as_bytes(), Format::Csv, &rules).expect("a header");
         rows.map(|row| row.expect("a file").expect("a row")).collect()
     }
 
@@ -198,6 +190,27 @@ pub(super) mod tests {
         let receivers =
             merged.items.iter().filter(|item| item.receiver_id.is_some() && item.target_id.is_none());
         assert_eq!(receivers.count(), 2);
+    }
+
+    #[test]
+    fn items_keep_the_ids_of_trackers_and_receivers() {
+        let boxes = format!(
+            "time,target_id,tracker_id,left,top,width,height\n{0},,7,1,2,3,4\n{0},a,8,1,2,3,4\n",
+            time(0.0)
+        );
+        let fixes = format!("time,receiver_id,longitude,latitude\n{},phone,3,4\n", time(1.0));
+        let merged =
+            RecordedStream::from_detections_and_fixes(rows(&boxes), rows(&fixes), None).expect("rows");
+        let ids: Vec<_> = merged
+            .items
+            .iter()
+            .map(|item| {
+                let target = item.target_id.as_ref().map(TargetId::as_str);
+                let tracker = item.tracker_id.as_ref().map(crate::domain::TrackerId::as_str);
+                (target, tracker, item.receiver_id.as_ref().map(ReceiverId::as_str))
+            })
+            .collect();
+        assert_eq!(ids, [(None, Some("7"), None), (Some("a"), None, None), (None, None, Some("phone"))]);
     }
 
     #[test]

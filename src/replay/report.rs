@@ -87,7 +87,7 @@ fn add_each(totals: &mut BTreeMap<String, u64>, more: BTreeMap<String, u64>) {
 /// acknowledgements `items` = `acknowledged` + `unacknowledged`.
 #[derive(Debug, Clone, Serialize)]
 pub struct ReplayReport {
-    /// Simulated cameras.
+    /// Number of simulated cameras.
     pub cameras: usize,
     /// Duration of the replay, s.
     pub elapsed_s: f64,
@@ -101,7 +101,7 @@ pub struct ReplayReport {
     pub answered: u64,
     /// Items refused, by reason.
     pub refused: BTreeMap<String, u64>,
-    /// Of these, items that are older than what their track takes, so that it did not move.
+    /// Number of these items that are older than what their track takes, so that it did not move.
     pub too_late: u64,
     /// Items whose answer the server dropped because this client read too slowly.
     pub lost_answers: u64,
@@ -115,9 +115,9 @@ pub struct ReplayReport {
     pub latency_ms: LatencyMs,
     /// Time from the failure of a stream to the next answer or acknowledgement; `None` if none failed.
     pub recovery_ms: Option<LatencyMs>,
-    /// Largest lag of sending behind the pace, ms.
+    /// Largest lag of sending, compared with the pace, ms.
     pub furthest_behind_ms: f64,
-    /// Streams opened.
+    /// Number of streams opened.
     pub streams: u64,
     /// Streams opened after a camera's first.
     pub reconnects: u64,
@@ -131,7 +131,7 @@ pub struct ReplayReport {
     pub cameras_moved: u64,
     /// Model versions that answered.
     pub model_versions: BTreeSet<u32>,
-    /// Injected faults.
+    /// Numbers of injected faults.
     pub injected: Injected,
     /// Cameras that gave up before everything was sent.
     pub given_up: u64,
@@ -142,13 +142,12 @@ pub struct ReplayReport {
 /// Quantiles of the latency in ms, at most 1 % above the true ones.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct LatencyMs {
-    /// Median.
     pub p50: f64,
     /// 90 % quantile.
     pub p90: f64,
     /// 99 % quantile.
     pub p99: f64,
-    /// Maximum; exact.
+    /// The maximum; exact.
     pub max: f64,
 }
 
@@ -211,7 +210,7 @@ impl ReplayReport {
         }
     }
 
-    /// Whether every item was answered (or its answer was dropped) and acknowledged.
+    /// True if every item was answered (or its answer was dropped) and acknowledged.
     #[must_use]
     pub fn is_complete(&self) -> bool {
         self.unanswered == 0 && self.unacknowledged.unwrap_or(0) == 0 && self.given_up == 0

@@ -15,9 +15,9 @@ struct BufferedItem {
     item: ScheduledItem,
     /// When it was sent on this stream, until its answer arrives.
     awaited_since: Option<Instant>,
-    /// Whether it was sent on this or an earlier stream.
+    /// True if it was sent on this or an earlier stream.
     sent: bool,
-    /// Whether its answer arrived or was dropped, on this or an earlier stream.
+    /// True if its answer arrived or was dropped, on this or an earlier stream.
     answered: bool,
 }
 
@@ -46,7 +46,7 @@ pub(super) struct ResendBuffer {
 pub(super) struct Answered {
     /// Time since the item was sent on this stream.
     pub(super) latency: Duration,
-    /// Whether it is the item's first answer.
+    /// True if it is the item's first answer.
     pub(super) is_first: bool,
 }
 
@@ -65,7 +65,7 @@ impl ResendBuffer {
         }
     }
 
-    /// Whether all items are done.
+    /// True if all items are done.
     pub(super) fn is_empty(&self) -> bool {
         self.items.is_empty()
     }

@@ -14,13 +14,13 @@ use super::progress::Counters;
 use super::report::Counts;
 use super::resend_buffer::{Answered, ResendBuffer};
 use crate::backoff::Backoff;
-use crate::domain::{LiveItem, ReceiverId, TargetId};
+use crate::domain::{LiveItem, ReceiverId, TargetId, TrackerId};
 use crate::grpc::client::{ClientError, Connection, Event, Events, ItemSender, Opening, SendPermit};
 use crate::grpc::proto::stream_answer::Outcome;
 use crate::grpc::proto::track_rejection::Reason;
 use crate::grpc::proto::{StreamAnswer, TrackRejection};
 
-/// What several cameras share.
+/// The state that several cameras share.
 pub(super) struct Link {
     /// Connection to the server, or to what stands before its nodes.
     pub(super) server: Connection,
@@ -33,7 +33,7 @@ pub(super) struct Link {
 pub(super) struct SimulatedCamera {
     options: Arc<ReplayOptions>,
     opening: Opening,
-    /// Appended to target ids where several simulated cameras share one camera of the server.
+    /// Appended to ids where several simulated cameras share one camera of the server.
     id_suffix: Option<String>,
     feed: PacedFeed,
     buffer: ResendBuffer,
@@ -41,7 +41,7 @@ pub(super) struct SimulatedCamera {
     link: Link,
     /// Where the next stream is opened.
     connection: Connection,
-    /// Whether nothing was answered since another node was named.
+    /// True if nothing was answered since another node was named.
     is_redirected: bool,
     /// Since when nothing has been answered after a failure.
     broken_at: Option<Instant>,
@@ -335,9 +335,11 @@ impl SimulatedCamera {
     fn with_suffixed_ids(&self, mut item: LiveItem) -> LiveItem {
         if let Some(suffix) = &self.id_suffix {
             let target = |id: TargetId| TargetId::new(&format!("{id}{suffix}")).unwrap_or(id);
+            let tracker = |id: TrackerId| TrackerId::new(&format!("{id}{suffix}")).unwrap_or(id);
             let receiver = |id: ReceiverId| ReceiverId::new(&format!("{id}{suffix}")).unwrap_or(id);
             item.target_id = item.target_id.map(target);
             item.receiver_id = item.receiver_id.map(receiver);
+            item.tracker_id = item.tracker_id.map(tracker);
         }
         item
     }

@@ -1,4 +1,4 @@
-//! What happens on one connection, so that one that is of no more use can be closed.
+//! The activity of one connection, so that an unused one can be closed.
 
 use std::collections::HashMap;
 use std::pin::Pin;
@@ -35,7 +35,7 @@ struct OpenRequests {
     responses: HashMap<u64, Arc<ResponseProgress>>,
 }
 
-/// Whether the connection has a part of a response that it has not sent yet.
+/// A part of a response that the connection has not sent yet, if there is one.
 #[derive(Default)]
 struct ResponseProgress {
     is_held_back: AtomicBool,
@@ -160,7 +160,7 @@ pub(super) struct ObservedBody<G> {
     request: OpenRequest,
     /// Counted by the status in the trailers.
     call: Option<RpcCall>,
-    /// What the request holds until its response has ended.
+    /// The grants that the request holds until its response has ended.
     _held: G,
 }
 

@@ -3,7 +3,6 @@
 //!
 //! `axum::serve` sets no deadlines: a half-sent header would stay open without end.
 
-use std::convert::Infallible;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,6 +13,7 @@ use hyper_util::server::conn::auto::Builder;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::time::{Instant, MissedTickBehavior};
+use tower::Service as _;
 
 use super::activity::Activity;
 use super::connection_gate::ConnectionGate;
@@ -54,7 +54,7 @@ pub(super) fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
     socket.listen(BACKLOG)
 }
 
-/// What becomes of the connections of one listener.
+/// Accepts the connections of one listener.
 pub(super) struct Acceptor {
     pub(super) pipeline: Arc<RequestPipeline>,
     pub(super) tls: Option<Arc<Tls>>,
@@ -93,13 +93,8 @@ impl Acceptor {
             };
             let server = server.clone();
             shutdown.spawn(async move {
-                let peer = Peer {
-                    client,
-                    address: address.ip().to_canonical(),
-                    certificate: None,
-                    is_tls: false,
-                    refusal,
-                };
+                let peer =
+                    Peer { address: address.ip().to_canonical(), certificate: None, is_tls: false, refusal };
                 server.serve(stream, peer).await;
                 drop(lease);
             });
@@ -143,7 +138,7 @@ fn builder(limits: &Limits) -> Builder<TokioExecutor> {
     builder
 }
 
-/// What all connections share.
+/// The state that all connections share.
 struct ConnectionServer {
     builder: Builder<TokioExecutor>,
     acceptor: Acceptor,
@@ -202,13 +197,10 @@ impl ConnectionServer {
         let activity = Activity::new();
         let mut closing = Closing::new(&self.limits, peer.refusal.is_some());
         let stream = TokioIo::new(GuardedStream::new(stream, &self.limits, activity.clone()));
-        let (pipeline, requests) = (self.acceptor.pipeline.clone(), activity.clone());
         let address = peer.address;
-        let service = service_fn(move |request| {
-            let (pipeline, peer, open) = (pipeline.clone(), peer.clone(), requests.request());
-            // hyper holds a place as large as this future as long as an HTTP/1 connection is open.
-            Box::pin(async move { Ok::<_, Infallible>(pipeline.answer(request, &peer, open).await) })
-        });
+        let layers = self.acceptor.pipeline.clone().service(peer, activity.clone());
+        // hyper holds a place as large as this future as long as an HTTP/1 connection is open.
+        let service = service_fn(move |request| Box::pin(layers.clone().call(request)));
         let mut connection = std::pin::pin!(self.builder.serve_connection(stream, service));
         let mut looks = tokio::time::interval(self.limits.idle_time() / LOOKS_PER_IDLE_TIME);
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -245,7 +237,7 @@ impl ConnectionServer {
     }
 }
 
-/// Whether the library ended a connection for a flood, such as of streams that are reset at once.
+/// True if the library ended a connection for a flood, such as of streams that are reset at once.
 fn is_flood(error: &(dyn std::error::Error + 'static)) -> bool {
     let causes = std::iter::successors(Some(error), |error| error.source());
     causes
@@ -253,7 +245,7 @@ fn is_flood(error: &(dyn std::error::Error + 'static)) -> bool {
         .any(|error| error.is_library() && error.reason() == Some(h2::Reason::ENHANCE_YOUR_CALM))
 }
 
-/// Whether the client is on this machine, by either of its addresses.
+/// True if the client is on this machine, by either of its addresses.
 fn is_of_this_machine(stream: &TcpStream, peer: &Peer) -> bool {
     let is_own = |own: SocketAddr| own.ip().to_canonical() == peer.address;
     peer.address.is_loopback() || stream.local_addr().is_ok_and(is_own)
@@ -269,7 +261,7 @@ struct Closing {
     reason: Option<CloseReason>,
 }
 
-/// What to do with a connection.
+/// The next action for a connection.
 enum ConnectionAction {
     Keep,
     /// Let open requests end and take no new ones.

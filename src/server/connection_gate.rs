@@ -1,4 +1,4 @@
-//! Which addresses may open connections: so many per second, and none for a while after a flood.
+//! Which addresses may open connections: a limited number per second, and none for a while after a flood.
 //!
 //! A client that is refused would connect again at once, which costs this machine more than the refusal. So refused
 //! connections are held open for a while and nothing is read of them, as far as there are places; the others are closed.

@@ -1,4 +1,4 @@
-//! What a request presents: a key, a browser's session, or the certificate of its connection.
+//! The credential of a request: a key, a browser's session, or the certificate of its connection.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;

@@ -5,6 +5,7 @@
 //! that this node answers costs the record alone. Imports are not recorded: any node stores them.
 
 use std::collections::VecDeque;
+use std::convert::Infallible;
 use std::io;
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -34,15 +35,15 @@ use tokio_rustls::TlsConnector;
 use super::activity::GRPC_STATUS;
 use super::proxies::{X_FORWARDED_FOR, X_FORWARDED_PROTO};
 use crate::admission::{Lease, RequestClass};
-use crate::app::access::Caller;
 use crate::domain::Error;
 use crate::grpc;
+use crate::request::RequestContext;
 use crate::shutdown::Shutdown;
 use crate::tls_client::{authorities, client_config};
 
 /// Marks a request that was sent on, which no node sends on again.
 const FORWARDED: HeaderName = HeaderName::from_static("x-sightfix-forwarded");
-/// Of one connection (RFC 9110, 7.6.1), or replaced by what the request to the other node says itself.
+/// Headers of one connection (RFC 9110, 7.6.1), or replaced by those of the request to the other node.
 const OF_ONE_CONNECTION: [HeaderName; 5] = [CONNECTION, HOST, TE, TRANSFER_ENCODING, UPGRADE];
 /// Time to open a connection to another node, its handshakes included.
 const OPEN_TIME: Duration = Duration::from_secs(3);
@@ -68,39 +69,36 @@ impl Forwarder {
     pub(super) async fn answer<F>(
         &self,
         request: Request<Body>,
-        class: RequestClass,
-        is_grpc: bool,
+        context: &RequestContext,
         memory: Result<Lease, Error>,
         answer_here: impl FnOnce(Request<Body>) -> F,
-    ) -> Response<Body>
+    ) -> Result<Response<Body>, Infallible>
     where
-        F: Future<Output = Response<Body>>,
+        F: Future<Output = Result<Response<Body>, Infallible>>,
     {
         // Sessions of browsers are those of one node.
         let is_own = request.headers().contains_key(FORWARDED) || request.headers().contains_key(COOKIE);
-        if is_own || matches!(class, RequestClass::Import | RequestClass::ImportStream) {
+        if is_own || matches!(context.class(), RequestClass::Import | RequestClass::ImportStream) {
             return answer_here(request).await;
         }
         let (parts, body) = request.into_parts();
-        let is_live = class == RequestClass::LiveStream;
+        let is_live = context.class() == RequestClass::LiveStream;
         let record = Record::of(body, self.record_bytes, memory.ok());
-        let head = copy_of(&parts);
-        let here = answer_here(Request::from_parts(parts, Body::new(RecordedBody(record.clone())))).await;
-        let (here, owner) = owner_of(here, is_grpc, is_live).await;
+        let head = copy_of(&parts, context);
+        let recorded = Request::from_parts(parts, Body::new(RecordedBody(record.clone())));
+        let here = answer_here(recorded).await?;
+        let (here, owner) = owner_of(here, context.is_grpc(), is_live).await;
         let Some(owner) = owner else {
             record.stop();
-            return here;
+            return Ok(here);
         };
-        let Some(body) = record.replay() else { return here };
+        let Some(body) = record.replay() else { return Ok(here) };
         // The client of a live stream opens it again elsewhere after the last acknowledgement.
         let body = if is_live { body.ended_by(self.shutdown.clone()) } else { body };
-        match self.send(&owner, head, body).await {
-            Ok(response) => response,
-            Err(error) => {
-                tracing::warn!(%owner, error = format!("{error:#}"), "a request could not be sent on to the node that has its camera");
-                here
-            }
-        }
+        Ok(self.send(&owner, head, body).await.unwrap_or_else(|error| {
+            tracing::warn!(%owner, error = format!("{error:#}"), "a request could not be sent on to the node that has its camera");
+            here
+        }))
     }
 
     async fn send(&self, owner: &Uri, head: Parts, body: Replay) -> anyhow::Result<Response<Body>> {
@@ -140,7 +138,7 @@ trait ByteStream: AsyncRead + AsyncWrite + Send + Unpin {}
 impl<S: AsyncRead + AsyncWrite + Send + Unpin> ByteStream for S {}
 
 /// The head of a request as another node gets it.
-fn copy_of(parts: &Parts) -> Parts {
+fn copy_of(parts: &Parts, context: &RequestContext) -> Parts {
     let (mut copy, ()) = Request::new(()).into_parts();
     copy.method = parts.method.clone();
     copy.uri = parts.uri.clone();
@@ -151,13 +149,10 @@ fn copy_of(parts: &Parts) -> Parts {
     // The other node may trust this one, which is no word for what the client claims.
     copy.headers.remove(X_FORWARDED_FOR);
     copy.headers.remove(X_FORWARDED_PROTO);
-    let address = parts.extensions.get::<Caller>().and_then(|caller| caller.actor().address);
-    if let Some(address) = address.and_then(|address| HeaderValue::from_str(&address.to_string()).ok()) {
+    if let Ok(address) = HeaderValue::from_str(&context.address().to_string()) {
         copy.headers.insert(X_FORWARDED_FOR, address);
     }
-    if let Some(scheme) =
-        parts.extensions.get::<Scheme>().and_then(|it| HeaderValue::from_str(it.as_str()).ok())
-    {
+    if let Ok(scheme) = HeaderValue::from_str(context.scheme().as_str()) {
         copy.headers.insert(X_FORWARDED_PROTO, scheme);
     }
     copy.headers.insert(FORWARDED, HeaderValue::from_static("1"));
@@ -211,7 +206,7 @@ struct Recorded {
     read: Option<VecDeque<Result<Frame<Bytes>, axum::Error>>>,
     /// How much more may be recorded, bytes.
     room_bytes: usize,
-    /// What is recorded, as limits count it.
+    /// The memory of the recorded bytes, as limits count it.
     memory: Option<Lease>,
 }
 
@@ -297,7 +292,7 @@ struct Replay {
     rest: Body,
     /// When it ends, whatever the client still sends.
     end: Option<BoxFuture<'static, ()>>,
-    /// What was read, as limits count it.
+    /// The memory of the bytes read, as limits count it.
     memory: Option<Lease>,
 }
 

@@ -7,7 +7,7 @@ use tokio::time::Instant;
 
 use crate::admission::TokenBucket;
 
-/// What a client begins an HTTP/2 connection with (RFC 9113, 3.4).
+/// The first bytes of a client's HTTP/2 connection (RFC 9113, 3.4).
 pub(super) const PREFACE: &[u8; 24] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 
 const FRAME_HEADER_BYTES: usize = 9;
@@ -23,11 +23,11 @@ pub(super) struct FrameLimit {
 
 /// Where among frames the client's next byte belongs.
 enum Position {
-    /// So many bytes of the preface were there.
+    /// Number of bytes of the preface that were there.
     Preface(usize),
-    /// So many bytes of a frame header were there.
+    /// Number of bytes of a frame header that were there.
     Header([u8; FRAME_HEADER_BYTES], usize),
-    /// So many bytes of a frame's payload are still to come.
+    /// Number of bytes of a frame's payload that are still to come.
     Payload(usize),
     /// The connection speaks HTTP/1.
     NotHttp2,
@@ -47,7 +47,7 @@ impl FrameLimit {
         }
     }
 
-    /// How many control frames begin in these bytes.
+    /// Number of control frames that begin in these bytes.
     fn control_frames(&mut self, mut bytes: &[u8]) -> u32 {
         let mut frames = 0;
         while !bytes.is_empty() {

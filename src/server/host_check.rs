@@ -1,4 +1,4 @@
-//! Whether a request was meant for this server, and by whom: `Host` and `Origin`.
+//! Check that a request was meant for this server, and by whom: `Host` and `Origin`.
 //!
 //! A web page can make its visitor's browser send requests to a server that only the visitor reaches:
 //! directly (`Origin` gives it away), or through a name of its own that it points at the server's

@@ -1,8 +1,8 @@
-//! What every request goes through, whatever its transport: id, span, host and origin, admission,
-//! deadline, then the transport.
+//! The way of a request from its connection to its transport: layers from top to bottom, the same for REST and gRPC.
+//! The first one makes the request's [`RequestContext`]; what the others learn and grant is written into it.
 
 use std::convert::Infallible;
-use std::sync::OnceLock;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::Router;
@@ -12,28 +12,31 @@ use hyper::header::{CONNECTION, CONTENT_ENCODING, CONTENT_TYPE, EXPECT, X_CONTEN
 use hyper::http::HeaderValue;
 use hyper::http::uri::Scheme;
 use hyper::{Method, Request, Response, Version};
-use tower::{Layer as _, Service as _, ServiceExt as _, service_fn};
+use tower::util::option_layer;
+use tower::{Layer as _, Service, service_fn};
 use tower_http::cors::CorsLayer;
 use tracing::field::{Empty, display};
 use tracing::{Instrument as _, Span};
 
-use super::activity::{GRPC_STATUS, ObservedBody, OpenRequest};
+use super::activity::{Activity, GRPC_STATUS, ObservedBody};
+use super::async_layer::async_layer;
 use super::credentials::credential;
 use super::forward::Forwarder;
 use super::host_check::HostCheck;
 use super::peer::Peer;
 use super::proxies::TrustedProxies;
 use super::refused_body::{Discards, read_in_vain};
-use super::request_body::{AdmittedBody, RateGuard, Ticket};
+use super::request_body::{AdmittedBody, RateGuard};
 use super::revocable_body::RevocableBody;
-use crate::admission::{BodyRefusal, ClientId, RequestClass};
+use crate::admission::{ClientId, RequestClass};
 use crate::app::App;
-use crate::app::access::{Caller, Credential, Permission, Principal};
+use crate::app::access::{Caller, Credential, Principal};
 use crate::config::Console;
 use crate::domain::{Error, ErrorKind, Result};
+use crate::request::{RequestContext, RequestHead};
 use crate::shutdown::Shutdown;
-use crate::telemetry::{MatchedRoute, Metrics, OTHER_RPC, REQUEST_ID, REQUESTS, RequestId, RpcCall};
-use crate::{grpc, http};
+use crate::telemetry::{Metrics, OTHER_RPC, REQUEST_ID, REQUESTS, RequestId, RpcCall};
+use crate::{grpc, http, operations};
 
 /// Longest request id that is taken from a client, in bytes.
 const LONGEST_REQUEST_ID: usize = 128;
@@ -49,19 +52,7 @@ enum Audience {
     Monitoring,
 }
 
-/// How a request is counted.
-enum Counted {
-    Http(MatchedRoute),
-    Grpc(RpcCall),
-}
-
-impl Counted {
-    const fn is_grpc(&self) -> bool {
-        matches!(self, Self::Grpc(_))
-    }
-}
-
-/// The way from a connection to the transports.
+/// The state that the layers of all connections of a listener share.
 pub(super) struct RequestPipeline {
     app: App,
     http: http::Transport,
@@ -76,17 +67,30 @@ pub(super) struct RequestPipeline {
     cors: Option<CorsLayer>,
 }
 
-/// What a request was granted.
-struct Granted {
-    ticket: Ticket,
-    caller: Caller,
-    /// As limits count the caller.
-    client: ClientId,
-    class: RequestClass,
+/// The state that the layers of one connection share.
+struct Connection {
+    pipeline: Arc<RequestPipeline>,
+    peer: Peer,
+    activity: Arc<Activity>,
 }
 
-/// The body of every response; it holds the request's memory until its end.
-pub(super) type ResponseBody = ObservedBody<Option<Ticket>>;
+/// The body of every response; it holds what the request was granted until its end.
+pub(super) type ResponseBody = ObservedBody<RequestContext>;
+
+/// A request below the layer of CORS, with what the layers know of it.
+struct Exchange<B> {
+    on: Arc<Connection>,
+    context: RequestContext,
+    request: Request<B>,
+}
+
+/// The service below a layer.
+trait Next<Q, E>: Service<Q, Response = Response<Body>, Error = E, Future: Send> + Send + 'static {}
+
+impl<S, Q, E> Next<Q, E> for S where
+    S: Service<Q, Response = Response<Body>, Error = E, Future: Send> + Send + 'static
+{
+}
 
 impl RequestPipeline {
     pub(super) fn new(
@@ -132,193 +136,286 @@ impl RequestPipeline {
         &self.app.metrics
     }
 
-    /// Answers a request.
-    pub(super) async fn answer(
-        &self,
-        request: Request<Incoming>,
-        peer: &Peer,
-        open: OpenRequest,
-    ) -> Response<ResponseBody> {
-        let began = Instant::now();
-        let peer = &*self.proxies.original(peer, request.headers());
-        let is_http_1 = request.version() < Version::HTTP_2;
-        let id = self.request_id(&request);
-        let counted = self.begin_count(&request);
-        let span = tracing::debug_span!(
-            target: REQUESTS, "request", id = %id, method = %request.method(), path = &*http::shown_path(request.uri().path()), key = Empty
+    /// The service of one connection, whose requests pass these layers from top to bottom.
+    pub(super) fn service(
+        self: Arc<Self>,
+        peer: Peer,
+        activity: Arc<Activity>,
+    ) -> impl Service<
+        Request<Incoming>,
+        Response = Response<ResponseBody>,
+        Error = Infallible,
+        Future: Send + 'static,
+    > + Clone {
+        let cors = self.cors.clone();
+        let on = Arc::new(Connection { pipeline: self, peer, activity });
+        let same = on.clone();
+        let layers = (
+            async_layer(move |request, next| observe(on.clone(), request, next)),
+            option_layer(cors),
+            async_layer(move |request, next| explain_refusal(same.clone(), request, next)),
+            async_layer(authenticate),
+            async_layer(admit),
+            async_layer(limit_time),
+            async_layer(forward),
         );
-        #[cfg(feature = "otel")]
-        crate::telemetry::continue_trace(&span, request.headers());
-        let (mut response, ticket) =
-            self.respond(request, &counted, peer, &id).instrument(span.clone()).await;
-        let headers = response.headers_mut();
-        headers.insert(REQUEST_ID, id.header().clone());
-        headers.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-        if peer.refusal.is_some() && is_http_1 {
-            headers.insert(CONNECTION, HeaderValue::from_static("close"));
-        }
-        let call = span.in_scope(|| self.count(counted, &response, peer, began.elapsed()));
-        response.map(|body| ObservedBody::new(body, open, call, ticket))
+        layers.layer(service_fn(transport))
     }
+}
 
-    /// Which transport a request is for, and how it is counted.
-    fn begin_count(&self, request: &Request<Incoming>) -> Counted {
-        if self.audience == Audience::Clients && has_grpc_content(request) {
-            let rpc = Permission::named_rpc(request.uri().path()).unwrap_or(OTHER_RPC);
-            Counted::Grpc(self.app.metrics.call(rpc))
-        } else {
-            Counted::Http(MatchedRoute::default())
-        }
+/// Gives the request its context and its span, and counts and logs the answer.
+async fn observe<S: Next<Request<Incoming>, Infallible>>(
+    on: Arc<Connection>,
+    mut request: Request<Incoming>,
+    mut next: S,
+) -> Result<Response<ResponseBody>, Infallible> {
+    let (began, open) = (Instant::now(), on.activity.request());
+    let metrics = &on.pipeline.app.metrics;
+    let context = on.context(&request);
+    request.extensions_mut().insert(context.clone());
+    let rpc = || operations::rpc_name(request.uri().path()).unwrap_or(OTHER_RPC);
+    let call = context.is_grpc().then(|| metrics.call(rpc()));
+    let closes = on.peer.refusal.is_some() && request.version() < Version::HTTP_2;
+    let span = tracing::debug_span!(
+        target: REQUESTS, "request", id = %context.id(), method = %request.method(), path = &*http::shown_path(request.uri().path()), key = Empty
+    );
+    #[cfg(feature = "otel")]
+    crate::telemetry::continue_trace(&span, request.headers());
+    let mut response = next.call(request).instrument(span.clone()).await?;
+    let headers = response.headers_mut();
+    headers.insert(REQUEST_ID, context.id().header().clone());
+    headers.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+    if closes {
+        headers.insert(CONNECTION, HeaderValue::from_static("close"));
     }
+    let call = span.in_scope(|| count(metrics, call, &response, &context, began.elapsed()));
+    Ok(response.map(|body| ObservedBody::new(body, open, call, context)))
+}
 
-    /// Counts and logs an answer. A call of an RPC is counted when it ends.
-    fn count(
-        &self,
-        counted: Counted,
-        response: &Response<Body>,
-        peer: &Peer,
-        time: Duration,
-    ) -> Option<RpcCall> {
-        let (status, duration_ms, client) =
-            (response.status().as_u16(), time.as_secs_f64() * 1e3, peer.address);
-        match counted {
-            Counted::Http(matched) => {
-                let route = matched.get();
-                self.app.metrics.answered(route, status, time);
-                tracing::debug!(target: REQUESTS, route = route.template, status, %client, duration_ms, "answered");
-                None
-            }
-            Counted::Grpc(mut call) => {
-                call.answered(time);
-                let grpc_status = response.headers().get(GRPC_STATUS);
-                if let Some(grpc_status) = grpc_status {
-                    call.ended(grpc_status.as_bytes());
-                }
-                tracing::debug!(target: REQUESTS, ?grpc_status, %client, duration_ms, "answered");
-                Some(call)
-            }
-        }
-    }
-
-    /// The response, and the ticket of a request that was admitted.
-    async fn respond(
-        &self,
-        request: Request<Incoming>,
-        counted: &Counted,
-        peer: &Peer,
-        id: &RequestId,
-    ) -> (Response<Body>, Option<Ticket>) {
-        let Some(cors) = &self.cors else { return self.admit_and_route(request, counted, peer, id).await };
-        let granted = OnceLock::new();
-        let service = service_fn(|request| async {
-            let (response, ticket) = self.admit_and_route(request, counted, peer, id).await;
-            // The service is called once.
-            let _ = granted.set(ticket);
-            Ok::<_, Infallible>(response)
-        });
-        let Ok(response) = cors.layer(service).oneshot(request).await;
-        (response, granted.into_inner().flatten())
-    }
-
-    async fn admit_and_route(
-        &self,
-        request: Request<Incoming>,
-        counted: &Counted,
-        peer: &Peer,
-        id: &RequestId,
-    ) -> (Response<Body>, Option<Ticket>) {
-        let is_grpc = counted.is_grpc();
-        match self.admit(request, counted, peer, id).await {
-            Ok((request, granted)) => {
-                let response = self.route(is_grpc, request, &granted, id).await;
-                (response, Some(granted.ticket))
-            }
-            Err(error) => {
-                if error.kind() == ErrorKind::Overloaded {
-                    self.app.metrics.refused();
-                }
-                (refuse(is_grpc, &error, id), None)
-            }
-        }
-    }
-
-    /// The request as the transports get it, with what it was granted; the body of a refused one is
-    /// read to its end before.
-    async fn admit(
-        &self,
-        request: Request<Incoming>,
-        counted: &Counted,
-        peer: &Peer,
-        id: &RequestId,
-    ) -> Result<(Request<Body>, Granted)> {
+impl Connection {
+    /// The context of a request, by its head.
+    fn context(&self, request: &Request<Incoming>) -> RequestContext {
+        let RequestPipeline { app, proxies, audience, .. } = &*self.pipeline;
+        let sender = proxies.original(&self.peer, request.headers());
+        let is_grpc = *audience == Audience::Clients && has_grpc_content(request);
         let path = request.uri().path();
-        let is_grpc = counted.is_grpc();
-        let class = if is_grpc { grpc::class(path) } else { http::class(request.method(), path) };
-        let has_body = !request.body().is_end_stream();
-        let presented = credential(&request, peer.certificate.as_ref(), peer.is_tls, is_grpc);
-        let (access, clock) = (&self.app.access, &self.app.clock);
-        if access.is_worth_refresh(presented, clock.monotonic())
-            && let Err(error) = access.refresh(&self.app.store, clock).await
-        {
-            tracing::warn!(%error, "cannot look for a new key");
-        }
-        let granted = match self.grant(&request, class, is_grpc, peer, id) {
-            Ok(granted) if has_body => self.wait_for_refused(class, granted).await,
-            Ok(granted) => Ok(granted),
-            Err(error) => Err(error),
+        let head = RequestHead {
+            id: request_id(app, request),
+            is_grpc,
+            class: if is_grpc { grpc::class(path) } else { http::class(request.method(), path) },
+            scheme: if sender.is_tls { Scheme::HTTPS } else { Scheme::HTTP },
+            address: sender.address,
         };
-        match granted {
-            Ok(granted) => {
-                let Granted { ticket, caller, client, .. } = &granted;
-                let limits = &self.app.limits;
-                // A live stream may be silent for longer, and looks after that itself.
-                let pace = (class != RequestClass::LiveStream)
-                    .then(|| RateGuard::new(limits.body_grace(), limits.body_bytes_per_s));
-                let mut request = request
-                    .map(|body| Body::new(AdmittedBody::new(body, ticket.clone(), caller.clone(), pace)));
-                let extensions = request.extensions_mut();
-                extensions.insert(id.clone());
-                extensions.insert(*client);
-                extensions.insert(caller.clone());
-                extensions.insert(if peer.is_tls { Scheme::HTTPS } else { Scheme::HTTP });
-                if let Counted::Http(matched) = counted {
-                    extensions.insert(matched.clone());
-                }
-                if class == RequestClass::ImportStream {
-                    extensions.insert(ticket.refusal());
-                }
-                Ok((request, granted))
-            }
-            Err(error) => {
-                // HTTP/2 ends the stream alone.
-                self.discard_refused(request, &error, peer).await;
-                Err(error)
-            }
+        RequestContext::new(head, app.quotas.clone())
+    }
+}
+
+/// The client's own id where it can be logged as it is, else a new one.
+fn request_id(app: &App, request: &Request<Incoming>) -> RequestId {
+    let own = request.headers().get(REQUEST_ID).filter(|id| {
+        (1..=LONGEST_REQUEST_ID).contains(&id.len()) && id.as_bytes().iter().all(u8::is_ascii_graphic)
+    });
+    let id = own.cloned().unwrap_or_else(|| {
+        let uuid = app.randomness.uuid_v7(app.clock.now());
+        let mut text = [0; uuid::fmt::Hyphenated::LENGTH];
+        let text = uuid.hyphenated().encode_lower(&mut text);
+        #[expect(clippy::expect_used, reason = "its form is fixed")]
+        HeaderValue::from_str(text).expect("a UUID is ASCII")
+    });
+    RequestId::new(id)
+}
+
+fn has_grpc_content(request: &Request<Incoming>) -> bool {
+    let content_type = request.headers().get(CONTENT_TYPE);
+    content_type.is_some_and(|content_type| content_type.as_bytes().starts_with(b"application/grpc"))
+}
+
+/// Counts and logs an answer. A call of an RPC is counted when it ends.
+fn count(
+    metrics: &Metrics,
+    call: Option<RpcCall>,
+    response: &Response<Body>,
+    context: &RequestContext,
+    time: Duration,
+) -> Option<RpcCall> {
+    let (client, duration_ms) = (context.address(), time.as_secs_f64() * 1e3);
+    let Some(mut call) = call else {
+        let (route, status) = (context.route(), response.status().as_u16());
+        metrics.answered(route, status, time);
+        tracing::debug!(target: REQUESTS, route = route.template, status, %client, duration_ms, "answered");
+        return None;
+    };
+    call.answered(time);
+    let grpc_status = response.headers().get(GRPC_STATUS);
+    if let Some(grpc_status) = grpc_status {
+        call.ended(grpc_status.as_bytes());
+    }
+    tracing::debug!(target: REQUESTS, ?grpc_status, %client, duration_ms, "answered");
+    Some(call)
+}
+
+/// Answers what the layers below refuse, in the form of the request's transport.
+async fn explain_refusal<S: Next<Exchange<Incoming>, Error>>(
+    on: Arc<Connection>,
+    request: Request<Incoming>,
+    mut next: S,
+) -> Result<Response<Body>, Infallible> {
+    #[expect(clippy::expect_used, reason = "the first layer inserts it")]
+    let context = RequestContext::of(request.extensions()).expect("a context").clone();
+    let exchange = Exchange { on: on.clone(), context: context.clone(), request };
+    Ok(next.call(exchange).await.unwrap_or_else(|error| {
+        if error.kind() == ErrorKind::Overloaded {
+            on.pipeline.app.metrics.refused();
         }
+        let (is_grpc, id) = (context.is_grpc(), context.id());
+        if is_grpc { grpc::refusal(&error, id) } else { http::refusal(&error, id) }
+    }))
+}
+
+/// Finds out who makes the request, and whether they may. A response that is open for long ends with the caller's key.
+async fn authenticate<S: Next<Exchange<Incoming>, Error>>(
+    Exchange { on, context, request }: Exchange<Incoming>,
+    mut next: S,
+) -> Result<Response<Body>> {
+    let app = &on.pipeline.app;
+    if app.access.is_worth_refresh(&on.credential(&context, &request), app.clock.monotonic())
+        && let Err(error) = app.access.refresh(&app.store, &app.clock).await
+    {
+        tracing::warn!(%error, "cannot look for a new key");
+    }
+    if let Err(error) = on.identify(&context, &request) {
+        on.pipeline.discard_refused(&context, request, &error).await;
+        return Err(error);
+    }
+    let response = next.call(Exchange { on, context: context.clone(), request }).await?;
+    if !context.caller().is_revocable() || response.body().size_hint().exact().is_some() {
+        return Ok(response);
+    }
+    Ok(response.map(|body| Body::new(RevocableBody::new(body, context))))
+}
+
+impl Connection {
+    fn credential<'r>(&'r self, context: &RequestContext, request: &'r Request<Incoming>) -> Credential<'r> {
+        let is_tls = *context.scheme() == Scheme::HTTPS;
+        credential(request, self.peer.certificate.as_ref(), is_tls, context.is_grpc())
+    }
+
+    fn identify(&self, context: &RequestContext, request: &Request<Incoming>) -> Result<()> {
+        let RequestPipeline { app, hosts, .. } = &*self.pipeline;
+        let is_probe = context.class() == RequestClass::Probe;
+        if let Some(Error::Refused(refusal)) = self.peer.refusal.as_deref()
+            && !is_probe
+        {
+            return Err(Error::Refused(refusal.clone()));
+        }
+        hosts.check(request)?;
+        let caller = self.caller(context, request).map_err(|error| {
+            // Guesses of keys count for the address that they come from.
+            self.pipeline.count_anonymous(context.address().into()).err().unwrap_or(error)
+        })?;
+        if let Some(key) = caller.actor().key_id {
+            Span::current().record("key", display(key));
+        }
+        context.authenticated(caller);
+        let client = context.client();
+        match context.caller().principal() {
+            _ if is_probe => {}
+            Principal::Anonymous => self.pipeline.count_anonymous(client)?,
+            _ => app.quotas.request_rate.count(client, tokio::time::Instant::now())?,
+        }
+        if context.is_grpc() {
+            // `http` compares a route's permission itself: it knows the template of the path.
+            context.caller().authorize(operations::rpc_permission(request.uri().path()))?;
+        }
+        Ok(())
+    }
+
+    fn caller(&self, context: &RequestContext, request: &Request<Incoming>) -> Result<Caller> {
+        let RequestPipeline { app, hosts, audience, .. } = &*self.pipeline;
+        if *audience == Audience::Monitoring {
+            return Ok(Caller::program("monitoring"));
+        }
+        let credential = self.credential(context, request);
+        if let Credential::Session(_) = credential {
+            hosts.check_same_origin(request)?;
+        }
+        let principal = match app.access.authenticate(credential, app.clock.now(), app.clock.monotonic()) {
+            // A probe learns that the server is alive, whatever has become of its key.
+            Err(_) if context.class() == RequestClass::Probe => Principal::Anonymous,
+            principal => principal?,
+        };
+        Ok(Caller::new(principal, Some(context.address()), Some(context.id().as_str().into())))
+    }
+}
+
+impl RequestPipeline {
+    /// Counts a request without a credential that works.
+    fn count_anonymous(&self, client: ClientId) -> Result<()> {
+        let (quotas, now) = (&self.app.quotas, tokio::time::Instant::now());
+        quotas.request_rate.count(client, now)?;
+        quotas.anonymous_rate.count(client, now)
     }
 
     /// Reads the body of a request that was refused by its head. That of a stranger counts for the address.
-    async fn discard_refused(&self, request: Request<Incoming>, error: &Error, peer: &Peer) {
+    async fn discard_refused(&self, context: &RequestContext, request: Request<Incoming>, error: &Error) {
         let (bodies, now) = (&self.app.quotas.refused_bodies, tokio::time::Instant::now);
+        let address = ClientId::from(context.address());
         let is_stranger = matches!(error.kind(), ErrorKind::Unauthenticated | ErrorKind::PermissionDenied);
-        let is_in_debt = is_stranger && bodies.wait(peer.client, now()).is_some();
+        let is_in_debt = is_stranger && bodies.wait(address, now()).is_some();
         // HTTP/2 ends the stream alone, and one that waits for `100 Continue` sends no more.
         let is_read = request.version() < Version::HTTP_2 && !request.headers().contains_key(EXPECT);
         let bytes = self.discards.read((is_read && !is_in_debt).then(|| request.into_body())).await;
         if is_stranger {
-            bodies.charge(peer.client, bytes, now());
+            bodies.charge(address, bytes, now());
         }
     }
+}
 
+/// Grants the request memory, its body a least rate, and a place among the requests at work once the body has come.
+async fn admit<S: Next<Exchange<Body>, Error>>(
+    Exchange { on, context, request }: Exchange<Incoming>,
+    mut next: S,
+) -> Result<Response<Body>> {
+    let pipeline = &*on.pipeline;
+    let has_body = !request.body().is_end_stream();
+    let waited = if has_body { pipeline.wait_for_refused(&context).await } else { Ok(()) };
+    if let Err(error) = waited.and_then(|()| pipeline.grant(&context, &request)) {
+        pipeline.discard_refused(&context, request, &error).await;
+        return Err(error);
+    }
+    let is_encoded = request.headers().contains_key(CONTENT_ENCODING);
+    // HTTP/2 ends the stream alone, and one that waits for `100 Continue` sends no more.
+    let is_discarded = !context.is_grpc() && !request.headers().contains_key(EXPECT);
+    let limits = &pipeline.app.limits;
+    // A live stream may be silent for longer, and looks after that itself.
+    let pace = (context.class() != RequestClass::LiveStream)
+        .then(|| RateGuard::new(limits.body_grace(), limits.body_bytes_per_s));
+    let request = request.map(|body| Body::new(AdmittedBody::new(body, context.clone(), pace)));
+    let answer = next.call(Exchange { on: on.clone(), context: context.clone(), request }).await;
+    let rest = context.end_work().filter(|_| is_discarded);
+    let response = answer?;
+    // An import stream reports by itself what it has stored of a body that was refused.
+    if let Some(error) = context.body_refusal().filter(|_| context.class() != RequestClass::ImportStream) {
+        pipeline.discards.read(rest).await;
+        return Err(error);
+    }
+    let is_refused = response.status().is_client_error() || response.status().is_server_error();
+    let discarded = pipeline.discards.read(rest.filter(|_| is_refused)).await;
+    let in_vain = read_in_vain(&response, context.received_bytes(), discarded, is_encoded, limits);
+    let bodies = &pipeline.app.quotas.refused_bodies;
+    bodies.charge(context.client(), in_vain, tokio::time::Instant::now());
+    Ok(response)
+}
+
+impl RequestPipeline {
     /// A client whose bodies were refused is served again after a while; until then it waits for the refusal, or it
     /// would send the next at once.
-    async fn wait_for_refused(&self, class: RequestClass, granted: Granted) -> Result<Granted> {
-        if matches!(class, RequestClass::Probe | RequestClass::LiveStream) {
-            return Ok(granted);
+    async fn wait_for_refused(&self, context: &RequestContext) -> Result<()> {
+        if matches!(context.class(), RequestClass::Probe | RequestClass::LiveStream) {
+            return Ok(());
         }
         let bodies = &self.app.quotas.refused_bodies;
-        let Some(wait) = bodies.wait(granted.client, tokio::time::Instant::now()) else { return Ok(granted) };
-        drop(granted);
+        let Some(wait) = bodies.wait(context.client(), tokio::time::Instant::now()) else { return Ok(()) };
         tokio::select! {
             () = tokio::time::sleep(wait.min(REFUSED_WAIT)) => {}
             () = self.shutdown.forced() => return Err(shutting_down()),
@@ -330,187 +427,42 @@ impl RequestPipeline {
         Err(Error::refused(ErrorKind::RateLimited, message))
     }
 
-    fn grant(
-        &self,
-        request: &Request<Incoming>,
-        class: RequestClass,
-        is_grpc: bool,
-        peer: &Peer,
-        id: &RequestId,
-    ) -> Result<Granted> {
-        if let Some(Error::Refused(refusal)) = peer.refusal.as_deref()
-            && class != RequestClass::Probe
-        {
-            return Err(Error::Refused(refusal.clone()));
-        }
-        self.hosts.check(request)?;
-        let caller = self.caller(request, class, is_grpc, peer, id).map_err(|error| {
-            // Guesses of keys count for the address that they come from.
-            self.count_anonymous(peer.client).err().unwrap_or(error)
-        })?;
-        let client = caller.actor().key_id.map_or(peer.client, ClientId::Key);
-        match caller.principal() {
-            _ if class == RequestClass::Probe => {}
-            Principal::Anonymous => self.count_anonymous(client)?,
-            _ => self.app.quotas.request_rate.count(client, tokio::time::Instant::now())?,
-        }
-        if is_grpc {
-            // `http` compares a route's permission itself: it knows the template of the path.
-            caller.authorize(Permission::of_rpc(request.uri().path()))?;
-        }
+    fn grant(&self, context: &RequestContext, request: &Request<Incoming>) -> Result<()> {
         let limits = &self.app.limits;
-        let held_bytes = match class {
+        let held_bytes = match context.class() {
             // Spooled, or read message by message, each with limits of its own.
             RequestClass::Import | RequestClass::ImportStream | RequestClass::LiveStream => 0,
-            _ if is_grpc => limits.message_bytes,
+            _ if context.is_grpc() => limits.message_bytes,
             _ if request.uri().path().ends_with("/picture") => limits.picture_bytes,
             _ => limits.body_bytes,
         };
-        let ticket = Ticket::open(&self.app, class, client, held_bytes)?;
+        context.open(held_bytes)?;
         if request.headers().contains_key(CONTENT_ENCODING) {
-            // What it decodes to is not known before it has been read.
-            ticket.charge(held_bytes as u64)?;
+            // Its decoded size is not known before it has been read.
+            context.charge_whole_body()?;
         }
         let has_no_body = request.body().is_end_stream()
             || matches!(*request.method(), Method::GET | Method::HEAD | Method::DELETE | Method::OPTIONS);
-        if has_no_body || class == RequestClass::ImportStream {
-            ticket.begin_work()?;
+        if has_no_body || context.class() == RequestClass::ImportStream {
+            context.begin_work()?;
         }
-        Ok(Granted { ticket, caller, client, class })
-    }
-
-    /// Counts a request without a credential that works.
-    fn count_anonymous(&self, client: ClientId) -> Result<()> {
-        let (quotas, now) = (&self.app.quotas, tokio::time::Instant::now());
-        quotas.request_rate.count(client, now)?;
-        quotas.anonymous_rate.count(client, now)
-    }
-
-    /// Who makes the request.
-    fn caller(
-        &self,
-        request: &Request<Incoming>,
-        class: RequestClass,
-        is_grpc: bool,
-        peer: &Peer,
-        id: &RequestId,
-    ) -> Result<Caller> {
-        if self.audience == Audience::Monitoring {
-            return Ok(Caller::program("monitoring"));
-        }
-        let credential = credential(request, peer.certificate.as_ref(), peer.is_tls, is_grpc);
-        if let Credential::Session(_) = credential {
-            self.hosts.check_same_origin(request)?;
-        }
-        let clock = &self.app.clock;
-        let principal = match self.app.access.authenticate(credential, clock.now(), clock.monotonic()) {
-            // What watches the server learns that it is alive, whatever has become of its key.
-            Err(_) if class == RequestClass::Probe => Principal::Anonymous,
-            principal => principal?,
-        };
-        let caller = Caller::new(principal, Some(peer.address), Some(id.as_str().into()));
-        if let Some(key) = caller.actor().key_id {
-            Span::current().record("key", display(key));
-        }
-        Ok(caller)
-    }
-
-    async fn route(
-        &self,
-        is_grpc: bool,
-        request: Request<Body>,
-        granted: &Granted,
-        id: &RequestId,
-    ) -> Response<Body> {
-        let Granted { ticket, caller, class, .. } = granted;
-        let time = Duration::from_secs(self.app.limits.request_s);
-        // An import stream reports by itself what it has stored of a body that was refused.
-        let reports_refusal = request.extensions().get::<BodyRefusal>().is_some();
-        let is_encoded = request.headers().contains_key(CONTENT_ENCODING);
-        // HTTP/2 ends the stream alone, and one that waits for `100 Continue` sends no more.
-        let is_discarded = !is_grpc && !request.headers().contains_key(EXPECT);
-        let answer_here = |request| async move {
-            if !is_grpc {
-                return self.http.answer(request).await;
-            }
-            let memory = self.app.quotas.decoded_memory(granted.client, ticket.refusal());
-            let answer = memory.scope(self.grpc.clone().call(request)).await;
-            answer.unwrap_or_else(|never| match never {})
-        };
-        let answer = async {
-            match &self.forwarder {
-                Some(forwarder) => {
-                    let memory = self.app.quotas.open_request(granted.client);
-                    forwarder.answer(request, *class, is_grpc, memory, answer_here).await
-                }
-                None => answer_here(request).await,
-            }
-        };
-        let answer = tokio::select! {
-            biased;
-            answer = tokio::time::timeout(time, answer) => answer.map_err(|_| too_slow(time)),
-            error = caller.ended() => Err(error),
-            () = self.shutdown.forced() => Err(shutting_down()),
-        };
-        let rest = ticket.end_work().filter(|_| is_discarded);
-        let refusal = ticket.refusal().get().filter(|_| !reports_refusal);
-        match (answer, refusal) {
-            (Err(error), _) => self.refuse_admitted(is_grpc, &error, id),
-            (Ok(_), Some(error)) => {
-                self.discards.read(rest).await;
-                self.refuse_admitted(is_grpc, &error, id)
-            }
-            (Ok(response), None) => {
-                let is_refused = response.status().is_client_error() || response.status().is_server_error();
-                let discarded = self.discards.read(rest.filter(|_| is_refused)).await;
-                let response = if is_grpc { grpc::explain(response, id) } else { response };
-                let received = ticket.received_bytes();
-                let in_vain = read_in_vain(&response, received, discarded, is_encoded, &self.app.limits);
-                let bodies = &self.app.quotas.refused_bodies;
-                bodies.charge(granted.client, in_vain, tokio::time::Instant::now());
-                revocable(response, caller, is_grpc.then_some(id))
-            }
-        }
-    }
-
-    fn refuse_admitted(&self, is_grpc: bool, error: &Error, id: &RequestId) -> Response<Body> {
-        if error.kind() == ErrorKind::Overloaded {
-            self.app.metrics.refused();
-        }
-        refuse(is_grpc, error, id)
-    }
-
-    /// The client's own id where it can be logged as it is, else a new one.
-    fn request_id<B>(&self, request: &Request<B>) -> RequestId {
-        let own = request.headers().get(REQUEST_ID).filter(|id| {
-            (1..=LONGEST_REQUEST_ID).contains(&id.len()) && id.as_bytes().iter().all(u8::is_ascii_graphic)
-        });
-        let id = own.cloned().unwrap_or_else(|| {
-            let uuid = self.app.randomness.uuid_v7(self.app.clock.now());
-            let mut text = [0; uuid::fmt::Hyphenated::LENGTH];
-            let text = uuid.hyphenated().encode_lower(&mut text);
-            #[expect(clippy::expect_used, reason = "its form is fixed")]
-            HeaderValue::from_str(text).expect("a UUID is ASCII")
-        });
-        RequestId::new(id)
+        Ok(())
     }
 }
 
-fn has_grpc_content(request: &Request<Incoming>) -> bool {
-    let content_type = request.headers().get(CONTENT_TYPE);
-    content_type.is_some_and(|content_type| content_type.as_bytes().starts_with(b"application/grpc"))
-}
-
-/// A response that may be open for long ends when the key of its request does.
-fn revocable(response: Response<Body>, caller: &Caller, id: Option<&RequestId>) -> Response<Body> {
-    if !caller.is_revocable() || response.body().size_hint().exact().is_some() {
-        return response;
+/// Ends a request that takes too long, whose caller's key was revoked, or that the shutdown does not wait for.
+async fn limit_time<S: Next<Exchange<Body>, Error>>(
+    exchange: Exchange<Body>,
+    mut next: S,
+) -> Result<Response<Body>> {
+    let (on, context) = (exchange.on.clone(), exchange.context.clone());
+    let time = Duration::from_secs(on.pipeline.app.limits.request_s);
+    tokio::select! {
+        biased;
+        answer = tokio::time::timeout(time, next.call(exchange)) => answer.unwrap_or_else(|_| Err(too_slow(time))),
+        error = context.caller().ended() => Err(error),
+        () = on.pipeline.shutdown.forced() => Err(shutting_down()),
     }
-    response.map(|body| Body::new(RevocableBody::new(body, caller.clone(), id.cloned())))
-}
-
-fn refuse(is_grpc: bool, error: &Error, id: &RequestId) -> Response<Body> {
-    if is_grpc { grpc::refusal(error, id) } else { http::refusal(error, id) }
 }
 
 fn too_slow(time: Duration) -> Error {
@@ -519,4 +471,31 @@ fn too_slow(time: Duration) -> Error {
 
 fn shutting_down() -> Error {
     Error::refused(ErrorKind::ShuttingDown, "the server shuts down and did not finish the request in time")
+}
+
+/// Sends the request on to the node that has its camera, where the settings say so.
+async fn forward<S: Next<Exchange<Body>, Infallible>>(
+    exchange: Exchange<Body>,
+    mut next: S,
+) -> Result<Response<Body>> {
+    let on = exchange.on.clone();
+    let answer = match &on.pipeline.forwarder {
+        Some(forwarder) => {
+            let Exchange { on, context, request } = exchange;
+            let (memory, asked) = (on.pipeline.app.quotas.open_request(context.client()), context.clone());
+            let answer_here = |request| next.call(Exchange { on, context, request });
+            forwarder.answer(request, &asked, memory, answer_here).await
+        }
+        None => next.call(exchange).await,
+    };
+    Ok(answer.unwrap_or_else(|never| match never {}))
+}
+
+/// Answers by the transport.
+async fn transport(Exchange { on, context, request }: Exchange<Body>) -> Result<Response<Body>, Infallible> {
+    if !context.is_grpc() {
+        return Ok(on.pipeline.http.answer(request).await);
+    }
+    let answer = context.clone().scope(on.pipeline.grpc.clone().call(request)).await?;
+    Ok(grpc::explain(answer, context.id()))
 }

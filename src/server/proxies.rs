@@ -9,7 +9,6 @@ use hyper::HeaderMap;
 use hyper::header::HeaderName;
 
 use super::peer::Peer;
-use crate::admission::ClientId;
 
 /// Addresses of the client and of the proxies that passed its request on, in this order.
 pub(super) const X_FORWARDED_FOR: HeaderName = HeaderName::from_static("x-forwarded-for");
@@ -51,10 +50,10 @@ impl TrustedProxies {
             }
         }
         let is_tls = headers.get(X_FORWARDED_PROTO).map_or(peer.is_tls, |scheme| scheme == "https");
-        Cow::Owned(Peer { client: ClientId::from(address), address, is_tls, ..peer.clone() })
+        Cow::Owned(Peer { address, is_tls, ..peer.clone() })
     }
 
-    /// Whether an address, in its canonical form, is a trusted proxy's.
+    /// True if an address, in its canonical form, is a trusted proxy's.
     pub(super) fn trusts(&self, address: IpAddr) -> bool {
         self.0.iter().any(|network| network.contains(address))
     }
@@ -71,7 +70,7 @@ fn address_of(entry: &str) -> Option<IpAddr> {
 #[derive(Clone)]
 struct Network {
     first: Ipv6Addr,
-    /// Of the 128 bits of an IPv6 address, to which IPv4 addresses are mapped.
+    /// Length of the prefix in the 128 bits of an IPv6 address, to which IPv4 addresses are mapped.
     prefix_bits: u32,
 }
 
@@ -114,7 +113,7 @@ mod tests {
         let proxies = ["10.0.0.0/8".to_owned(), "fd00::1".to_owned()];
         let proxies = TrustedProxies::new(&proxies).expect("networks");
         let address: IpAddr = from.parse().expect("an address");
-        let peer = Peer { client: address.into(), address, certificate: None, is_tls: false, refusal: None };
+        let peer = Peer { address, certificate: None, is_tls: false, refusal: None };
         let mut headers = HeaderMap::new();
         for value in forwarded {
             headers.append(X_FORWARDED_FOR, HeaderValue::from_str(value).expect("a header"));

@@ -55,13 +55,13 @@ impl Discards {
                 bytes += frame.data_ref().map_or(0, Bytes::len) as u64;
             }
         };
-        // Whether all came or not, the answer is the same.
+        // The answer does not depend on the rest.
         let _ = tokio::time::timeout(DISCARD_TIME, reading).await;
         bytes
     }
 }
 
-/// What a client is charged for a body of so many bytes, and a rest that was discarded: nothing unless it was refused.
+/// The bytes that a client is charged for a body and a rest that was discarded: nothing unless it was refused.
 pub(super) fn read_in_vain(
     response: &Response<Body>,
     received_bytes: u64,
@@ -71,7 +71,7 @@ pub(super) fn read_in_vain(
 ) -> u64 {
     let is = |kind| response.status().as_u16() == status::of(kind).http;
     let is_refused = match response.headers().get(GRPC_STATUS).map(HeaderValue::to_str) {
-        // Of the codes of gRPC only this one is always about the content.
+        // Among the codes of gRPC only this one is always about the content.
         Some(code) => {
             let invalid = status::of(ErrorKind::InvalidArgument).grpc;
             code.is_ok_and(|code| code.parse::<i32>() == Ok(invalid))
@@ -82,10 +82,10 @@ pub(super) fn read_in_vain(
         return 0;
     }
     let body_bytes = limits.body_bytes as u64;
-    // What was decoded is not known here; what a body may be at most is.
+    // The decoded size is not known here; the largest size that a body may have is.
     let is_decoded = is_encoded && received_bytes > 0;
     let read_bytes = if is_decoded { received_bytes.max(body_bytes) } else { received_bytes };
-    // What is beyond a limit is not looked at.
+    // Bytes beyond a limit are not looked at.
     let most_bytes = if is(ErrorKind::TooLarge) { body_bytes } else { u64::MAX };
     (read_bytes + discarded_bytes).min(most_bytes)
 }

@@ -6,7 +6,6 @@
 
 use std::fmt;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
@@ -14,141 +13,21 @@ use bytes::Bytes;
 use hyper::body::{Body, Frame, Incoming, SizeHint};
 use tokio::time::{Instant, Sleep};
 
-use crate::admission::{BodyRefusal, ClientId, Lease, RequestClass};
-use crate::app::App;
-use crate::app::access::Caller;
 use crate::domain::{Error, ErrorKind, Result};
-
-/// What one request was granted, shared between its body and the pipeline.
-#[derive(Clone)]
-pub(super) struct Ticket(Arc<Mutex<Grant>>);
-
-struct Grant {
-    app: App,
-    class: RequestClass,
-    client: ClientId,
-    /// Most bytes of the body that are held in memory and charged for.
-    charged_bytes: u64,
-    received_bytes: u64,
-    memory: Option<Lease>,
-    place: Option<Lease>,
-    refusal: BodyRefusal,
-    /// What its reader left of the body.
-    rest: Option<Incoming>,
-    is_answered: bool,
-}
-
-impl Ticket {
-    /// A request that may send its body. At most `charged_bytes` of it are held in memory.
-    ///
-    /// # Errors
-    /// `Overloaded`.
-    pub(super) fn open(
-        app: &App,
-        class: RequestClass,
-        client: ClientId,
-        charged_bytes: usize,
-    ) -> Result<Self> {
-        let memory = match class {
-            RequestClass::Probe => None,
-            _ => Some(app.quotas.open_request(client)?),
-        };
-        let grant = Grant {
-            app: app.clone(),
-            class,
-            client,
-            charged_bytes: charged_bytes as u64,
-            received_bytes: 0,
-            memory,
-            place: None,
-            refusal: BodyRefusal::default(),
-            rest: None,
-            is_answered: false,
-        };
-        Ok(Self(Arc::new(Mutex::new(grant))))
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Grant> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Takes the place among the requests at work.
-    ///
-    /// # Errors
-    /// `Overloaded`.
-    pub(super) fn begin_work(&self) -> Result<()> {
-        let mut grant = self.lock();
-        if grant.place.is_none() {
-            grant.place = grant.app.quotas.begin_work(grant.class, grant.client)?;
-        }
-        Ok(())
-    }
-
-    /// The work is done and the answer begins. What its reader left of the body is for the caller.
-    pub(super) fn end_work(&self) -> Option<Incoming> {
-        let mut grant = self.lock();
-        grant.place = None;
-        grant.is_answered = true;
-        grant.rest.take()
-    }
-
-    /// Keeps what its reader leaves of a body until the answer begins.
-    fn leave(&self, rest: Incoming) {
-        let mut grant = self.lock();
-        if !grant.is_answered {
-            grant.rest = Some(rest);
-        }
-    }
-
-    /// Bytes of the body that were passed on.
-    pub(super) fn received_bytes(&self) -> u64 {
-        self.lock().received_bytes
-    }
-
-    fn receive(&self, bytes: u64) -> Result<()> {
-        self.lock().received_bytes += bytes;
-        self.charge(bytes)
-    }
-
-    /// Why the body was refused, if it was or will be.
-    pub(super) fn refusal(&self) -> BodyRefusal {
-        self.lock().refusal.clone()
-    }
-
-    /// Charges for bytes that are held in memory, up to the most that are charged for.
-    ///
-    /// # Errors
-    /// `Overloaded`.
-    pub(super) fn charge(&self, bytes: u64) -> Result<()> {
-        let mut grant = self.lock();
-        let charged = bytes.min(grant.charged_bytes);
-        grant.charged_bytes -= charged;
-        match &mut grant.memory {
-            Some(memory) if charged > 0 => memory.try_grow(charged),
-            _ => Ok(()),
-        }
-    }
-
-    fn refuse(&self, error: Error) {
-        if let Error::Refused(refusal) = error {
-            self.lock().refusal.set(refusal);
-        }
-    }
-}
+use crate::request::RequestContext;
 
 /// The body of a request.
 pub(super) struct AdmittedBody {
     /// `None` once it has ended.
     body: Option<Incoming>,
-    ticket: Ticket,
-    caller: Caller,
+    context: RequestContext,
     /// `None` for a body that may be silent.
     pace: Option<RateGuard>,
 }
 
 impl AdmittedBody {
-    pub(super) const fn new(body: Incoming, ticket: Ticket, caller: Caller, pace: Option<RateGuard>) -> Self {
-        Self { body: Some(body), ticket, caller, pace }
+    pub(super) const fn new(body: Incoming, context: RequestContext, pace: Option<RateGuard>) -> Self {
+        Self { body: Some(body), context, pace }
     }
 
     /// Counts a frame, the last one of the body or not.
@@ -157,14 +36,13 @@ impl AdmittedBody {
         if let Some(pace) = &mut self.pace {
             pace.received(bytes);
         }
-        self.ticket.receive(bytes)?;
         // Readers that know the length do not ask for the end.
-        if is_last { self.ticket.begin_work() } else { Ok(()) }
+        self.context.receive(bytes, is_last)
     }
 
-    /// Ends the body with an error, which the ticket knows.
+    /// Ends the body with an error, which the context knows.
     fn refuse(&mut self, error: Error) -> Poll<Option<Result<Frame<Bytes>, BodyRefused>>> {
-        self.ticket.refuse(error);
+        self.context.refuse_body(&error);
         Poll::Ready(Some(Err(BodyRefused)))
     }
 }
@@ -179,7 +57,7 @@ impl Body for AdmittedBody {
     ) -> Poll<Option<Result<Frame<Bytes>, BodyRefused>>> {
         let this = &mut *self;
         let Some(mut body) = this.body.take() else { return Poll::Ready(None) };
-        if let Err(error) = this.caller.check_active() {
+        if let Err(error) = this.context.caller().check_active() {
             return this.refuse(error);
         }
         match Pin::new(&mut body).poll_frame(context) {
@@ -189,15 +67,15 @@ impl Body for AdmittedBody {
                     Poll::Ready(Some(Ok(frame)))
                 }
                 Err(error) => {
-                    this.ticket.leave(body);
+                    this.context.leave(body);
                     this.refuse(error)
                 }
             },
             Poll::Ready(Some(Err(error))) => {
-                let message = format!("the body broke off: {error}");
+                let message = format!("the body is incomplete: {error}");
                 this.refuse(Error::refused(ErrorKind::Cancelled, message))
             }
-            Poll::Ready(None) => match this.ticket.begin_work() {
+            Poll::Ready(None) => match this.context.begin_work() {
                 Ok(()) => Poll::Ready(None),
                 Err(error) => this.refuse(error),
             },
@@ -220,16 +98,16 @@ impl Body for AdmittedBody {
     }
 }
 
-/// What nobody reads is left to the pipeline.
+/// Leaves the unread rest to the layer that admits requests.
 impl Drop for AdmittedBody {
     fn drop(&mut self) {
         if let Some(rest) = self.body.take().filter(|body| !body.is_end_stream()) {
-            self.ticket.leave(rest);
+            self.context.leave(rest);
         }
     }
 }
 
-/// Tells a reader of the body that it was refused; the ticket knows why.
+/// Tells a reader of the body that it was refused; the context knows why.
 #[derive(Debug)]
 pub(super) struct BodyRefused;
 
@@ -294,7 +172,7 @@ impl LeastRate {
         Self { window, bytes_per_s, received: 0, waited: Duration::ZERO }
     }
 
-    /// Whether a window that is over brought enough; begins the next one.
+    /// True if a window that is over brought enough; begins the next one.
     fn holds(&mut self) -> bool {
         if self.waited < self.window {
             return true;
@@ -328,7 +206,7 @@ mod tests {
 
     const WINDOW: Duration = Duration::from_secs(10);
 
-    /// Whether the rate holds when so many bytes come after each of these times of waiting.
+    /// True if the rate holds when `bytes` bytes come after each of these times of waiting.
     fn holds(bytes: u64, waits_s: &[u64]) -> bool {
         let mut rate = LeastRate::new(WINDOW, 10);
         waits_s.iter().all(|&wait_s| {

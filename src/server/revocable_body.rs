@@ -9,31 +9,28 @@ use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 use hyper::body::{Body as HttpBody, Frame, SizeHint};
 
-use crate::app::access::Caller;
 use crate::domain::{Error, Result};
 use crate::grpc;
-use crate::telemetry::RequestId;
+use crate::request::RequestContext;
 
 /// Ends with an error status over gRPC; over REST it breaks off, so that nobody takes a part for the whole.
 pub(super) struct RevocableBody {
     body: Body,
-    caller: Caller,
-    /// Set over gRPC.
-    request_id: Option<RequestId>,
+    context: RequestContext,
     ended: Option<BoxFuture<'static, Error>>,
     is_over: bool,
 }
 
 impl RevocableBody {
-    pub(super) const fn new(body: Body, caller: Caller, request_id: Option<RequestId>) -> Self {
-        Self { body, caller, request_id, ended: None, is_over: false }
+    pub(super) const fn new(body: Body, context: RequestContext) -> Self {
+        Self { body, context, ended: None, is_over: false }
     }
 
     /// Why the body must end, if it must; the task is woken when it has to.
     fn poll_ended(&mut self, context: &mut Context<'_>) -> Poll<Error> {
-        let caller = &self.caller;
+        let request = &self.context;
         let ended = self.ended.get_or_insert_with(|| {
-            let caller = caller.clone();
+            let caller = request.caller().clone();
             async move { caller.ended().await }.boxed()
         });
         ended.poll_unpin(context)
@@ -41,9 +38,10 @@ impl RevocableBody {
 
     fn end(&mut self, error: &Error) -> Option<Result<Frame<Bytes>, axum::Error>> {
         self.is_over = true;
-        Some(match &self.request_id {
-            Some(id) => Ok(Frame::trailers(grpc::trailers(error, id))),
-            None => Err(axum::Error::new(error.to_string())),
+        Some(if self.context.is_grpc() {
+            Ok(Frame::trailers(grpc::trailers(error, self.context.id())))
+        } else {
+            Err(axum::Error::new(error.to_string()))
         })
     }
 }
@@ -59,7 +57,7 @@ impl HttpBody for RevocableBody {
         if self.is_over {
             return Poll::Ready(None);
         }
-        if let Err(error) = self.caller.check_active() {
+        if let Err(error) = self.context.caller().check_active() {
             return Poll::Ready(self.end(&error));
         }
         if let ready @ Poll::Ready(_) = Pin::new(&mut self.body).poll_frame(context) {

@@ -32,7 +32,7 @@ const FINGERPRINT_BYTES: usize = 8;
 /// The server's certificate, and the files that it is loaded from again when they change.
 pub(super) struct Tls {
     files: TlsFiles,
-    /// What certificates of the client authority may do, if there is one.
+    /// The scope of certificates of the client authority, if there is one.
     client_scope: Option<Arc<Scope>>,
     config: ArcSwap<ServerConfig>,
     loaded: Mutex<Vec<FileVersion>>,
@@ -65,7 +65,7 @@ impl Tls {
         Ok(Some(Arc::new(Self { files, client_scope, config, loaded })))
     }
 
-    /// Whether clients may present certificates.
+    /// True if clients may present certificates.
     pub(super) const fn takes_client_certificates(&self) -> bool {
         self.client_scope.is_some()
     }
@@ -86,7 +86,7 @@ impl Tls {
             }
             Err(error) => tracing::error!(
                 error = format!("{error:#}"),
-                "the changed certificate cannot be used; the one before stays in use"
+                "the changed certificate cannot be used; the previous one stays in use"
             ),
         }
     }

@@ -28,7 +28,7 @@ impl LogControl {
     /// Logs what another filter selects.
     ///
     /// # Errors
-    /// A filter that cannot be read; the one before stays.
+    /// A filter that cannot be read; the previous one stays.
     pub fn set_filter(&self, filter: &str) -> anyhow::Result<()> {
         self.filter.reload(EnvFilter::try_new(filter)?).context("cannot change the log's filter")
     }
@@ -104,7 +104,6 @@ impl RequestId {
         &self.0
     }
 
-    /// As text.
     #[must_use]
     pub fn as_str(&self) -> &str {
         self.0.to_str().unwrap_or_default()

@@ -26,23 +26,6 @@ impl Route {
 /// The RPC of requests that name none.
 pub const OTHER_RPC: &str = "other";
 
-/// The route that a request matched, once it has. Clones share it.
-#[derive(Clone, Default)]
-pub struct MatchedRoute(Arc<OnceLock<Route>>);
-
-impl MatchedRoute {
-    /// Records it; the first stays.
-    pub fn set(&self, route: Route) {
-        let _ = self.0.set(route);
-    }
-
-    /// The route, or [`Route::OTHER`].
-    #[must_use]
-    pub fn get(&self) -> Route {
-        self.0.get().copied().unwrap_or(Route::OTHER)
-    }
-}
-
 /// Names of the status codes of gRPC, by number.
 const RPC_CODES: [&str; 17] = [
     "OK",
@@ -66,7 +49,7 @@ const RPC_CODES: [&str; 17] = [
 const CANCELLED: usize = 1;
 const UNKNOWN: usize = 2;
 
-/// What is counted and timed of requests. Clones share it.
+/// Counts and durations of requests. Clones share it.
 #[derive(Clone)]
 pub(super) struct RequestMetrics(Arc<State>);
 

@@ -1,7 +1,7 @@
-//! What is particular to training runs of a camera: its samples, the fit, and the model version that it gives.
+//! Training runs of a camera: its samples, the fit, and the model version that it gives.
 
 use super::promotion::{self, PromotionCandidate};
-use super::training::{Trained, Update, finish, report};
+use super::run_jobs::{Trained, Update, finish, report};
 use super::{JobIdentity, Work, load_samples, load_unpaired};
 use crate::app::App;
 use crate::domain::{

@@ -10,9 +10,9 @@ use tokio::sync::oneshot;
 /// The lowest scheduling priority, so that background work takes only what serving leaves.
 const NICE: i32 = 19;
 
-/// What a job reports while it runs.
+/// The progress that a job reports while it runs.
 pub(super) trait JobProgress: Default + Send + 'static {
-    /// What was reported since the last call. Events are taken out; the current state stays.
+    /// Takes the events since the last call, and copies the current state, which stays.
     fn take(&mut self) -> Self;
 }
 
@@ -77,7 +77,7 @@ impl<P: JobProgress, O: Send + 'static> JobThread<P, O> {
         Ok(Self { shared, output, ended: None })
     }
 
-    /// What was reported since the last call.
+    /// Takes the progress since the last call.
     pub(super) fn take_progress(&self) -> P {
         self.shared.progress.lock().unwrap_or_else(PoisonError::into_inner).take()
     }

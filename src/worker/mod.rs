@@ -10,8 +10,8 @@ mod evaluation;
 mod job_thread;
 mod learning;
 mod promotion;
+mod run_jobs;
 mod site_training;
-mod training;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -59,10 +59,10 @@ pub async fn evaluate(app: App, settings: Workers, shutdown: Shutdown) {
     work::<EvaluationJob>(app, settings, shutdown).await;
 }
 
-/// What a job does on its thread.
+/// The work of a job on its thread.
 type Work<J> = Box<dyn FnOnce(&ProgressSink<<J as Job>::Progress>) -> <J as Job>::Output + Send>;
 
-/// What the log and the rules of attempts need of a job.
+/// The values of a job for the log and the rules of attempts.
 struct JobIdentity<'a> {
     id: Uuid,
     camera: Option<&'a CameraId>,
@@ -74,9 +74,9 @@ struct JobIdentity<'a> {
 trait Job: Send + Sync + Sized + 'static {
     /// Name of the kind in the log, and of its thread.
     const NAME: &'static str;
-    /// What the work reports while it runs.
+    /// The progress that the work reports while it runs.
     type Progress: JobProgress;
-    /// What the work gives.
+    /// The output of the work.
     type Output: Send + 'static;
 
     fn identity(&self) -> JobIdentity<'_>;
@@ -193,7 +193,7 @@ async fn run_attempt<J: Job>(
     shutdown: &Shutdown,
 ) -> Result<Option<JobState>> {
     if claim.job.identity().attempt > MAX_ATTEMPTS {
-        let outcome = format!("given up: {MAX_ATTEMPTS} workers claimed it and none came to its end");
+        let outcome = format!("given up: {MAX_ATTEMPTS} workers claimed it and none finished it");
         return J::fail(app, claim, outcome).await;
     }
     let mut thread = JobThread::spawn(J::NAME, J::prepare(app, claim).await?).map_err(Error::fault)?;

@@ -1,4 +1,4 @@
-//! Whether a new model version becomes active by itself.
+//! The decision to activate a new model version automatically.
 //!
 //! Two versions are compared by their mean distance to the fixes of held-out samples, that is, samples
 //! predicted by a fit that had not seen them. With each version a sample of its held-out errors is stored,
@@ -25,13 +25,13 @@ const STORED_ERRORS: usize = 2_000;
 /// between two fits of the same camera.
 const TOLERANCE: f64 = 1.05;
 
-/// Whether to activate, and a sentence for the operator.
+/// The decision to activate, with a sentence for the operator.
 pub(super) struct PromotionDecision {
     pub(super) activate: bool,
     pub(super) reason: String,
 }
 
-/// Whether to activate the new versions of all cameras of a site, and what was found per camera.
+/// The decision to activate the new versions of all cameras of a site, with the finding per camera.
 pub(super) struct SitePromotion {
     pub(super) activate: bool,
     /// A sentence for the operator.
@@ -40,7 +40,7 @@ pub(super) struct SitePromotion {
     pub(super) cameras: Vec<CameraPromotion>,
 }
 
-/// What was found of one camera of a site.
+/// The finding of one camera of a site.
 pub(super) struct CameraPromotion {
     /// The active version, if there is one.
     pub(super) compared_with: Option<u32>,
@@ -85,7 +85,7 @@ impl Comparison {
         self.active_m += active_m;
     }
 
-    /// Whether the new version is worse, by the means over all samples.
+    /// True if the new version is worse, by the means over all samples.
     fn new_is_worse(&self, tolerance: f64) -> bool {
         self.new_m > tolerance * self.active_m
     }
@@ -105,7 +105,7 @@ impl Comparison {
     }
 }
 
-/// What is known of a new version and the active one.
+/// The comparison of a new version with the active one.
 enum Finding {
     /// No active version can be used, for this reason.
     NoRival(String),

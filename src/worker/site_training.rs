@@ -1,8 +1,8 @@
-//! What is particular to training runs of a site: the samples of all cameras, the joint fit, and a model version of each
-//! camera, which are activated together or not at all.
+//! Training runs of a site: the samples of all cameras, the joint fit, and a model version of each camera, which are
+//! activated together or not at all.
 
 use super::promotion::{self, CameraPromotion, PromotionCandidate, SitePromotion};
-use super::training::{Trained, Update, finish, report};
+use super::run_jobs::{Trained, Update, finish, report};
 use super::{JobIdentity, Work, load_samples};
 use crate::app::App;
 use crate::domain::{
@@ -119,7 +119,7 @@ impl CameraSamples {
     }
 }
 
-/// What the run found out; the store enters the numbers of the versions.
+/// Returns the findings of the run; the store enters the numbers of the versions.
 fn site_report(
     models: &SiteModels,
     cameras: &[CameraSamples],

@@ -13,7 +13,7 @@ use hyper_util::client::legacy::Client as HttpClient;
 use hyper_util::rt::TokioExecutor;
 use prost::Message as _;
 use serde_json::{Value, json};
-use sightfix::app::access::{OPERATIONS, Operation, Permission};
+use sightfix::app::access::Permission;
 use sightfix::clock::{Clock, Randomness};
 use sightfix::config::Config;
 use sightfix::domain::{NewKey, Role, Scope};
@@ -21,6 +21,7 @@ use sightfix::grpc::proto;
 use sightfix::grpc::proto::camera_service_client::CameraServiceClient;
 use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 use sightfix::grpc::proto::key_service_client::KeyServiceClient;
+use sightfix::operations::{OPERATIONS, Operation};
 use sightfix::server::Server;
 use tempfile::TempDir;
 use tokio::sync::mpsc;
@@ -344,7 +345,7 @@ async fn a_server_without_keys_is_open_until_there_is_one() {
     assert_eq!(server.log_lines("no key exists").len(), 1, "the log says so");
     let caller = server.get("/v1/session").await.expect(200).json();
     assert_eq!((&caller["open_access"], &caller["role"]), (&json!(true), &json!("admin")), "{caller}");
-    // What a proxy or a client with a key adds does no harm.
+    // Headers that a proxy or a client with a key adds do no harm.
     server.send("GET", "/v1/cameras", &[("authorization", "Basic eDp5")], "").await.expect(200);
     let created = server.post("/v1/keys", &json!({"name": "first", "role": "viewer"})).await.expect(201);
     let viewer = created.json()["secret"].as_str().expect("a secret").to_owned();
@@ -680,7 +681,7 @@ async fn a_key_works_again_when_a_wrong_clock_is_set_back() {
     };
     assert_eq!(status().await, 200);
     wall_s.fetch_add(86_400, Ordering::SeqCst);
-    // What the server does every two seconds: it ends what is open for the key.
+    // As the server does every two seconds, ends the requests and streams of the key.
     app.access.refresh(&app.store, &app.clock).await.expect("read");
     assert_eq!(status().await, 401);
     wall_s.fetch_sub(86_400, Ordering::SeqCst);

@@ -126,7 +126,7 @@ async fn a_fix_that_comes_later_takes_the_place_of_none() {
     let report = csv(&server, (0..3_000).map(|second| row(second, false))).await;
     assert_eq!((&report["accepted"], &report["duplicate"]), (&json!(0), &json!(3_000)), "{report}");
     assert_eq!(counts(&server).await, (3_000, 2_000));
-    // What is counted survives a restart, and goes with the camera.
+    // The counts survive a restart, and go with the camera.
     assert!(server.terminate());
     let server = TestServer::start(folder.path());
     assert_eq!(counts(&server).await, (3_000, 2_000));
@@ -339,7 +339,7 @@ async fn training_uses_boxes_without_a_fix_up_to_a_limit() {
             "limit {limit}: {found} of {without_fix} boxes without a fix, {} samples",
             metadata["samples"]
         );
-        // Of each stride at most one is taken.
+        // At most one of each stride is taken.
         let least = used.min(without_fix.div_ceil(without_fix.div_ceil(used)) - 1);
         assert!((least as f64..=used as f64).contains(&found), "{found} of {used}");
         fingerprints.push((metadata["training_rows_sha256"].clone(), metadata["parameters"].clone()));

@@ -1,4 +1,4 @@
-//! What a client may leave half done, hold open or flood, and how the server ends all the same.
+//! Requests and connections that a client leaves half done, holds open or floods. The server ends all the same.
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
@@ -93,7 +93,7 @@ fn floods_of_control_frames_end_the_connection() {
         stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
         stream.write_all(PREFACE).expect("the server reads");
         let mut reader = stream.try_clone().expect("a second handle");
-        // What the server writes must be read, or it ends the connection for that.
+        // The server's bytes must be read, or it ends the connection for that.
         let reading = std::thread::spawn(move || {
             let mut read = [0; 4_096];
             loop {

@@ -45,7 +45,7 @@ async fn hashed_files_are_kept_for_a_year_and_sent_compressed() {
         let whole = asset(&server, path, &[]).await.expect(200);
         assert_eq!(whole.header("cache-control"), "public, max-age=31536000, immutable");
         assert!(!whole.headers.contains_key("content-encoding"));
-        // Of a hundred bytes a compressed form is not shorter.
+        // A compressed form of a hundred bytes is not shorter.
         if whole.body.len() < 512 {
             continue;
         }
@@ -187,8 +187,8 @@ async fn a_file_of_tiles_is_served_by_ranges_and_the_policy_stays() {
     assert_eq!((end.body.as_ref(), end.header("content-range")), (&content[2_000..], "bytes 2000-2007/2008"));
     let other = [("range", "bytes=0-9"), ("if-range", "\"other\"")];
     asset(&server, "/v1/tiles", &other).await.expect(200);
-    let behind = asset(&server, "/v1/tiles", &[("range", "bytes=2008-")]).await.expect(416).json();
-    assert_eq!(behind["violations"][0]["field"], "range", "{behind}");
+    let beyond = asset(&server, "/v1/tiles", &[("range", "bytes=2008-")]).await.expect(416).json();
+    assert_eq!(beyond["violations"][0]["field"], "range", "{beyond}");
 }
 
 #[tokio::test]

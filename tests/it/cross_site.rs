@@ -1,4 +1,4 @@
-//! What a web page of somebody else, opened by a person who reaches the server, can do to it.
+//! Requests of a foreign web page, opened by a person who reaches the server.
 
 use serde_json::json;
 use sightfix::grpc::proto;

@@ -58,7 +58,7 @@ fn has_ended(evaluation: &Value) -> bool {
     !matches!(evaluation["state"].as_str(), Some("queued" | "running" | "cancelling"))
 }
 
-/// Whether its worker has reported a phase.
+/// True if its worker has reported a phase.
 fn runs(evaluation: &Value) -> bool {
     evaluation["progress"]["phase"].as_str().is_some_and(|phase| !phase.is_empty())
 }

@@ -12,20 +12,20 @@ const EVENTS: &str = "/v1/cameras/c/events";
 
 /// An event as it was sent.
 #[derive(Debug, Clone, PartialEq)]
-struct Event {
+pub(crate) struct Event {
     id: String,
-    name: String,
-    data: Value,
+    pub(crate) name: String,
+    pub(crate) data: Value,
 }
 
 /// The events of an open response.
-struct Events {
+pub(crate) struct Events {
     body: Incoming,
     text: String,
 }
 
 impl Events {
-    async fn open(server: &TestServer, path: &str, last_event_id: Option<&str>) -> Self {
+    pub(crate) async fn open(server: &TestServer, path: &str, last_event_id: Option<&str>) -> Self {
         let headers: Vec<(&str, &str)> = last_event_id.into_iter().map(|id| ("last-event-id", id)).collect();
         let response = server.open("GET", path, &headers, "").await;
         assert_eq!(response.status(), 200);
@@ -33,7 +33,7 @@ impl Events {
     }
 
     /// The next event; `None` at the end of the stream.
-    async fn next(&mut self) -> Option<Event> {
+    pub(crate) async fn next(&mut self) -> Option<Event> {
         loop {
             if let Some((event, rest)) = self.text.split_once("\n\n") {
                 let field = |name: &str| {
@@ -130,11 +130,11 @@ async fn what_is_kept_no_more_is_said_to_be_lost() {
     }
     assert_eq!(times(&kept).last(), Some(&"2020-12-14T08:16:39Z"));
     // The next event goes on after the loss.
-    let mut behind = Events::open(&server, EVENTS, Some(&lost.id)).await;
-    assert_eq!(behind.next().await.as_ref(), kept.first());
+    let mut later = Events::open(&server, EVENTS, Some(&lost.id)).await;
+    assert_eq!(later.next().await.as_ref(), kept.first());
 
     // Another run of the server knows nothing of these events.
-    drop((events, again, behind));
+    drop((events, again, later));
     server.kill();
     let server = TestServer::start(folder.path());
     for id in [first.id.as_str(), "nonsense", "0000000000000000-5"] {

@@ -124,14 +124,14 @@ fn evaluated(arguments: &[&str], method: &str) -> [f64; 3] {
     [number("mean_m"), number("coverage50"), number("coverage95")]
 }
 
-/// The real square, one stretch of time held out in turn. The truth is the distance to a line, one of two
+/// The real square, one segment of time held out in turn. The truth is the distance to a line, one of two
 /// axes, of which an honest radius of 95 % holds 98.6 %.
 #[test]
 #[ignore = "needs ../shared/data; four minutes"]
-fn shared_square_is_covered_by_stretch() {
+fn shared_square_is_covered_by_segment() {
     let rows = std::fs::read_to_string(shared("square/training.csv")).expect("the recording");
     let (header, rows) = rows.split_once('\n').expect("a header");
-    let stretch = |row: &&str| match &row[..13] {
+    let segment = |row: &&str| match &row[..13] {
         time if time < "2020-12-15" => 0,
         time if time < "2020-12-15T13" => 1,
         _ => 2,
@@ -140,7 +140,7 @@ fn shared_square_is_covered_by_stretch() {
     for (held_out, most_m) in [(0, 0.50), (1, 0.98), (2, 1.15)] {
         let folder = data_folder();
         let file = |name: &str, keep: &dyn Fn(usize) -> bool| {
-            let own: Vec<&str> = rows.lines().filter(|row| keep(stretch(row))).collect();
+            let own: Vec<&str> = rows.lines().filter(|row| keep(segment(row))).collect();
             let path = folder.path().join(name);
             std::fs::write(&path, format!("{header}\n{}\n", own.join("\n"))).expect("written");
             path.to_str().expect("UTF-8").to_owned()
@@ -150,9 +150,9 @@ fn shared_square_is_covered_by_stretch() {
         let line = line.to_str().expect("UTF-8");
         let arguments = ["--train", &train, "--test", &test, "--truth-line", line, "--gnss-sigma-m", "2.2"];
         let [mean_m, half, covered] = evaluated(&arguments, "gaussian_process.two_step");
-        println!("stretch {held_out}: {mean_m:.3} m, {half:.3} inside 50 %, {covered:.3} inside 95 %");
-        assert!(mean_m <= most_m, "stretch {held_out}: {mean_m} m, not {most_m} m");
-        assert!(covered >= 0.9, "stretch {held_out}: {covered}");
+        println!("segment {held_out}: {mean_m:.3} m, {half:.3} inside 50 %, {covered:.3} inside 95 %");
+        assert!(mean_m <= most_m, "segment {held_out}: {mean_m} m, not {most_m} m");
+        assert!(covered >= 0.9, "segment {held_out}: {covered}");
     }
 }
 

@@ -216,7 +216,7 @@ impl TestServer {
         }
     }
 
-    /// Whether all threads of the process are stopped.
+    /// True if all threads of the process are stopped.
     fn is_stopped(&self) -> bool {
         let threads = std::fs::read_dir(format!("/proc/{}/task", self.pid())).expect("it is there");
         threads.flatten().all(|thread| {
@@ -236,7 +236,7 @@ impl TestServer {
         self.process.wait().expect("the server is gone");
     }
 
-    /// Whether the process has ended by itself.
+    /// True if the process has ended by itself.
     pub(crate) fn has_ended(&mut self) -> bool {
         self.process.try_wait().expect("the process can be asked").is_some()
     }

@@ -130,6 +130,44 @@ async fn rest_refuses_what_is_no_tensor_of_boxes() {
 }
 
 #[tokio::test]
+async fn elements_may_come_in_binary_after_the_json() {
+    let (server, _folder) = served().await;
+    let path = "/v2/models/square/infer";
+    let expected = server.post(path, &rest_request(json!(BOXES))).await.expect(200).json();
+    let elements: Vec<u8> = BOXES.concat().iter().flat_map(|number| number.to_le_bytes()).collect();
+    let request = |size: usize| {
+        let input = json!({"name": "boxes", "shape": [BOXES.len(), 4], "datatype": "FP64",
+            "parameters": {"binary_data_size": size}});
+        json!({"id": "7", "inputs": [input], "parameters": {"binary_data_output": true}}).to_string()
+    };
+    let send = |json: String, length: usize, elements: &[u8]| {
+        let body = [json.as_bytes(), elements].concat();
+        let length = length.to_string();
+        let server = &server;
+        // Without a type, as Triton's client sends it.
+        async move { server.send("POST", path, &[("inference-header-content-length", &length)], body).await }
+    };
+    let json = request(elements.len());
+    let answer = send(json.clone(), json.len(), &elements).await.expect(200).json();
+    assert_eq!(answer, expected);
+    let short = request(elements.len() - 4);
+    for (json, length, elements, field) in [
+        (json.clone(), json.len(), &elements[1..], "inputs[0].parameters.binary_data_size"),
+        (short.clone(), short.len(), &elements[4..], "inputs[0].parameters.binary_data_size"),
+        (json.clone(), json.len() + elements.len() + 1, &elements[..], "inference-header-content-length"),
+        (
+            rest_request(Value::Null).to_string(),
+            rest_request(Value::Null).to_string().len(),
+            &elements[..0],
+            "inputs[0].data",
+        ),
+    ] {
+        let refused = send(json, length, elements).await.expect(422).json();
+        assert_eq!(refused["violations"][0]["field"], field, "{refused}");
+    }
+}
+
+#[tokio::test]
 async fn grpc_answers_as_rest_does() {
     let (server, _folder) = served().await;
     let rest = server.post("/v2/models/square/infer", &rest_request(json!(BOXES))).await.expect(200).json();

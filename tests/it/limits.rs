@@ -99,7 +99,7 @@ async fn list_cameras(server: &TestServer, key: &str) -> Result<(), Status> {
 #[tokio::test]
 async fn clients_behind_a_trusted_proxy_are_told_apart() {
     let rate = ("SIGHTFIX_LIMITS__REQUESTS_PER_S", "2");
-    // Whether one of many requests is refused, each with its own value of the header.
+    // True if one of many requests is refused, each with its own value of the header.
     let is_limited = async |server: &TestServer, forwarded: fn(u8) -> String| {
         for number in 0..50 {
             let headers = [("x-forwarded-for", &*forwarded(number))];

@@ -168,7 +168,7 @@ async fn a_hangup_loads_the_log_filter_of_the_settings_again() {
     assert_eq!(entry["route"], "/v1/cameras", "{entry}");
     std::fs::write(&file, "log_filter = \"no such filter ===\"\n").expect("written");
     server.signal("-HUP");
-    let refused = server.logged(|entry| entry["message"] == "the log's filter stays").await;
+    let refused = server.logged(|entry| entry["message"] == "the log filter is unchanged").await;
     assert!(refused["error"].is_string(), "{refused}");
     assert!(server.terminate());
 }

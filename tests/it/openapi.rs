@@ -36,7 +36,7 @@ async fn the_server_tells_the_same_description_and_shows_it_offline() {
     }
 }
 
-/// What a parameter takes and what a body is can be read from the description, so that clients can be generated.
+/// The description states the values of a parameter and the form of a body, so that clients can be generated.
 #[test]
 fn parameters_with_few_values_list_them_and_lines_are_no_object() {
     let description: serde_json::Value = serde_json::from_str(&run(&["openapi"])).expect("JSON");

@@ -127,7 +127,7 @@ async fn start() -> (TempDir, TestServer, Provider) {
     (folder, server, provider)
 }
 
-/// What a browser has after it was sent to the provider.
+/// The state of a browser after it was sent to the provider.
 struct Begun {
     cookie: String,
     state: String,
@@ -204,7 +204,7 @@ async fn a_person_signs_in_and_has_the_role_of_their_group_until_they_sign_out()
     let mut events = server.open("GET", "/v1/cameras/c/events", &headers, "").await.into_body();
     server.send("DELETE", "/v1/session", &headers, "").await.expect(204);
     server.send("GET", "/v1/session", &headers, "").await.expect(401);
-    // What was open ends with the session.
+    // Open streams end with the session.
     while let Some(Ok(_)) = events.frame().await {}
 }
 

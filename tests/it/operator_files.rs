@@ -21,7 +21,7 @@ fn named(text: &str) -> BTreeSet<&str> {
     words.filter(|word| word.starts_with("sightfix_") || word.starts_with("process_")).collect()
 }
 
-/// Whether metrics have a series of that name.
+/// True if metrics have a series of that name.
 fn is_printed(metrics: &str, name: &str) -> bool {
     metrics.lines().any(|line| line.strip_prefix(name).is_some_and(|rest| rest.starts_with(['{', ' '])))
 }

@@ -71,7 +71,7 @@ fn observation(json: &Value) -> proto::Observation {
     }
 }
 
-/// What a refusal says, without what belongs to its transport.
+/// The contents of a refusal, without those of its transport.
 #[derive(Debug, PartialEq)]
 struct Refusal {
     reason: String,

@@ -41,7 +41,7 @@ async fn import(server: &TestServer, csv: String) {
     server.send("POST", "/v1/cameras/c/samples", &headers, csv).await.expect(200);
 }
 
-/// What a statement gives in the database of a folder.
+/// The output of a statement in the database of a folder.
 fn sql(folder: &Path, statement: &str) -> String {
     let [_, url] = store_arguments(folder);
     let output = std::process::Command::new("psql").args([&url, "-Atqc", statement]).output();
@@ -50,7 +50,7 @@ fn sql(folder: &Path, statement: &str) -> String {
     String::from_utf8_lossy(&output.stdout).trim().to_owned()
 }
 
-/// Of two processes the clock of one is 400 days ahead. Samples are deleted by the clock of the database.
+/// The clock of one of two processes is 400 days ahead. Samples are deleted by the clock of the database.
 #[tokio::test]
 #[ignore = "needs PostgreSQL: .ci/postgres"]
 async fn the_wrong_clock_of_one_node_deletes_no_samples() {

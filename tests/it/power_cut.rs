@@ -24,7 +24,7 @@ const IMPORTS: usize = 30;
 const ROWS: usize = 3;
 /// Cuts that are tried, each with both kinds of remains.
 const CUTS: usize = 60;
-/// What a disk writes as a whole.
+/// The unit that a disk writes as a whole.
 const SECTOR_BYTES: usize = 512;
 
 /// A file's content, as far as it is on the disk, and what was written to it since it was flushed.
@@ -158,7 +158,7 @@ impl Disk {
     }
 }
 
-/// What the record says happened, in its order.
+/// An event of the record, in its order.
 enum Event {
     Create(PathBuf),
     Remove(PathBuf),

@@ -1,4 +1,4 @@
-//! What is stored and for how long: durability, full disks, deletions, limits, permissions, and other
+//! Storage and its duration: durability, full disks, deletions, limits, permissions, and other
 //! processes in the same data folder.
 
 use std::fmt::Write as _;
@@ -135,7 +135,7 @@ async fn fill(server: &TestServer) -> Answer {
     panic!("a million samples fit");
 }
 
-/// What must hold on full storage, however it came to be full.
+/// Checks the behaviour on full storage, whatever filled it.
 async fn check_full_storage(server: &TestServer, refused: &Answer) {
     let said = problem(refused, 507, "insufficient-storage");
     assert!(said["detail"].as_str().is_some_and(|detail| detail.contains("delete")), "{said}");

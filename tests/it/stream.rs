@@ -406,7 +406,7 @@ async fn a_turned_camera_is_reported_everywhere_and_trained_again() {
         item
     };
     let mut client = open(&channel(&server).await, "edge-1", true).await;
-    // What holds until the model that is trained again answers is looked at as soon as the notice comes.
+    // The state until the model that is trained again answers is read as soon as the notice comes.
     let profile = async || server.get("/v1/cameras/yard").await.expect(200).json();
     let (mut notice, mut answer_after) = (None, None);
     let before = rows(&scene);

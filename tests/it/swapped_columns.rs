@@ -5,8 +5,10 @@ use std::fmt::Write as _;
 use futures_util::stream;
 use serde_json::{Value, json};
 use sightfix::grpc::proto;
+use sightfix::grpc::proto::camera_service_client::CameraServiceClient;
 use sightfix::grpc::proto::sample_service_client::SampleServiceClient;
 use sightfix::simulation::{Options, simulate};
+use tonic_types::StatusExt as _;
 
 use crate::harness::{TestServer, data_folder, sightfix};
 
@@ -100,6 +102,36 @@ async fn swapped_rows_are_told_by_the_cameras_other_positions() {
 }
 
 #[tokio::test]
+async fn fixes_are_compared_with_the_location_of_the_camera() {
+    let (_folder, server) = with_cameras(&["gate"]).await;
+    let (right, swapped) = (rows(Columns::Right), rows(Columns::Swapped));
+    let [longitude, latitude] = right[0].3;
+    let location = async |longitude: f64, latitude: f64| {
+        let change = json!({"location": {"longitude_deg": longitude, "latitude_deg": latitude}});
+        let headers = [("content-type", "application/merge-patch+json"), ("if-match", "*")];
+        server.send("PATCH", "/v1/cameras/gate", &headers, change.to_string()).await
+    };
+    location(longitude + 0.1, latitude - 0.1).await.expect(200);
+    let camera = server.get("/v1/cameras/gate").await.expect(200).json();
+    assert_eq!(camera["location"]["longitude_deg"], json!(longitude + 0.1));
+    // Five rows are too few for a mirror image, and there is no other position.
+    assert_eq!(import(&server, "gate", "", &right[..5]).await["warnings"], json!([]));
+    let report = import(&server, "gate", "", &swapped[5..10]).await;
+    let told = warning(&report);
+    assert!(told.contains("swapped in 5 of 5 fixes, or in the location of the camera's profile"), "{report}");
+    // A location in another city, although the fixes are where the stored ones are.
+    location(longitude + 1.0, latitude).await.expect(200);
+    let report = import(&server, "gate", "", &right[10..14]).await;
+    let told = warning(&report);
+    assert!(
+        told.contains("4 of 4 fixes are far from the camera") && told.contains("correct the location"),
+        "{report}"
+    );
+    let refused = location(longitude, 91.0).await.expect(422);
+    assert!(refused.text().contains("location.latitude_deg"), "{}", refused.text());
+}
+
+#[tokio::test]
 async fn grpc_and_the_command_tell_of_swapped_columns() {
     let (folder, server) = with_cameras(&["by-grpc", "by-command"]).await;
     let rows = rows(Columns::Swapped);
@@ -134,6 +166,24 @@ async fn grpc_and_the_command_tell_of_swapped_columns() {
     let report = samples.import_samples(stream::iter(messages)).await.expect("taken").into_inner();
     assert!(report.warnings[0].contains("swap the two columns"), "{report:?}");
 
+    let mut cameras = CameraServiceClient::new(server.channel().await);
+    let (longitude_deg, latitude_deg) = (Some(11.5), Some(48.1));
+    let location = Some(proto::Position { longitude_deg, latitude_deg });
+    let profile = Some(proto::CameraProfile { location, ..Default::default() });
+    let change =
+        proto::UpdateCameraRequest { camera_id: "by-grpc".to_owned(), profile, ..Default::default() };
+    let changed = cameras.update_camera(change.clone()).await.expect("taken").into_inner();
+    assert_eq!(changed.camera.expect("a camera").profile.expect("a profile").location, location);
+    let latitude_deg = Some(-91.0);
+    let profile = proto::CameraProfile {
+        location: Some(proto::Position { longitude_deg, latitude_deg }),
+        ..Default::default()
+    };
+    let refused =
+        cameras.update_camera(proto::UpdateCameraRequest { profile: Some(profile), ..change }).await;
+    let refused = refused.expect_err("no latitude").get_details_bad_request().expect("a field");
+    assert_eq!(refused.field_violations[0].field, "profile.location.latitude_deg");
+
     let file = folder.path().join("samples.csv");
     std::fs::write(&file, csv(&rows)).expect("written");
     let mut command = sightfix();
@@ -142,4 +192,10 @@ async fn grpc_and_the_command_tell_of_swapped_columns() {
     let text = [output.stdout, output.stderr].concat();
     let text = String::from_utf8_lossy(&text);
     assert!(output.status.success() && text.contains("warning: latitude and longitude"), "{text}");
+    let mut command = sightfix();
+    command.arg("import").arg(&file).args(["--camera", "elsewhere", "--data"]).arg(folder.path());
+    let output = command.args(["--create", "--location", "-70.5,-33.4"]).output().expect("the binary runs");
+    let text = [output.stdout, output.stderr].concat();
+    let text = String::from_utf8_lossy(&text);
+    assert!(output.status.success() && text.contains("fixes are far from the camera"), "{text}");
 }

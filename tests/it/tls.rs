@@ -1,6 +1,7 @@
 //! TLS on the shared port: both protocols, client certificates, certificates that change.
 
 use std::net::SocketAddr;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
@@ -12,6 +13,7 @@ use hyper::header::HeaderValue;
 use hyper::{Request, StatusCode};
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use rcgen::{BasicConstraints, Certificate, CertificateParams, DnType, IsCa, Issuer, KeyPair};
+use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
 use rustls::{ClientConfig, RootCertStore};
 use tempfile::TempDir;
@@ -88,8 +90,17 @@ async fn connect(
     protocols: &[&str],
     own: Option<(Certificate, KeyPair)>,
 ) -> std::io::Result<TlsStream<TcpStream>> {
+    connect_with_root(address, authority.certificate.der().clone(), protocols, own).await
+}
+
+async fn connect_with_root(
+    address: SocketAddr,
+    root: CertificateDer<'static>,
+    protocols: &[&str],
+    own: Option<(Certificate, KeyPair)>,
+) -> std::io::Result<TlsStream<TcpStream>> {
     let mut roots = RootCertStore::empty();
-    roots.add(authority.certificate.der().clone()).expect("an authority");
+    roots.add(root).expect("an authority");
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let builder = ClientConfig::builder_with_provider(provider)
         .with_safe_default_protocol_versions()
@@ -153,6 +164,53 @@ async fn both_protocols_are_served_over_tls_and_plain_http_on_this_machine() {
     run(&["health", "--listen", &server.address.to_string()]);
     let foreign = connect(server.address, &Authority::new(), &["h2"], None).await;
     assert!(foreign.is_err(), "the client checks the certificate");
+}
+
+#[tokio::test]
+async fn a_phone_that_trusts_the_made_authority_reaches_the_server() {
+    let (data, folder) = (data_folder(), data_folder());
+    let path = |name: &str| folder.path().join(name);
+    let made = |days: &str| {
+        let mut command = sightfix();
+        command.args([
+            "tls",
+            "self-signed",
+            "--host",
+            "192.0.2.7",
+            "--host",
+            "localhost",
+            "--days",
+            days,
+            "--out",
+        ]);
+        command.arg(folder.path()).output().expect("it runs")
+    };
+    assert_eq!(made("826").status.code(), Some(2), "phones refuse it");
+    let output = made("825");
+    let lines = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success() && lines.contains("sightfix serve --listen 0.0.0.0:8443"), "{lines}");
+    let notes = String::from_utf8_lossy(&output.stderr);
+    assert!(notes.contains("https://192.0.2.7:8443/walk"), "{notes}");
+    assert!(!made("825").status.success(), "files that exist stay");
+    let mode = path("key.pem").metadata().expect("a file").permissions().mode();
+    assert_eq!(mode & 0o077, 0, "others cannot read the key");
+
+    let authority = std::fs::read_to_string(path("authority.pem")).expect("a file");
+    let root = CertificateDer::from_pem_slice(authority.as_bytes()).expect("a certificate");
+    let mut command = sightfix();
+    command.args(["serve", "--listen", "127.0.0.1:0", "--data"]).arg(data.path()).stdout(Stdio::null());
+    command.arg("--tls-cert").arg(path("certificate.pem")).arg("--tls-key").arg(path("key.pem"));
+    command.env("SIGHTFIX_CONSOLE__AUTHORITY", path("authority.pem"));
+    let server = TestServer::run(command);
+    let stream = connect_with_root(server.address, root, &["http/1.1"], None).await.expect("a handshake");
+    assert_eq!(get(stream, "/authority.crt", None).await, (StatusCode::OK, authority));
+}
+
+#[tokio::test]
+async fn a_server_without_an_authority_says_how_to_make_one() {
+    let data = data_folder();
+    let answer = TestServer::start(data.path()).get("/authority.crt").await.expect(404);
+    assert!(answer.text().contains("sightfix tls self-signed"), "{}", answer.text());
 }
 
 #[tokio::test]
@@ -247,7 +305,7 @@ async fn holders_of_certificates_have_idempotency_keys_of_their_own() {
     }
 }
 
-/// Whether the server presents a certificate of the authority.
+/// True if the server presents a certificate of the authority.
 async fn trusts(address: SocketAddr, authority: &Authority) -> bool {
     connect(address, authority, &["h2"], None).await.is_ok()
 }
@@ -268,7 +326,7 @@ async fn a_changed_certificate_is_loaded_and_a_broken_one_is_not() {
     server
         .logged(|entry| entry["message"].as_str().is_some_and(|text| text.contains("cannot be used")))
         .await;
-    assert!(trusts(&second).await, "the one before stays");
+    assert!(trusts(&second).await, "the previous one stays");
     files.replace(&first);
     while !trusts(&first).await {
         tokio::time::sleep(Duration::from_millis(100)).await;

@@ -27,8 +27,8 @@ async fn trained(folder: &std::path::Path, recipe: &str) -> TestServer {
 fn walk(seed: u64, seconds: usize) -> Vec<SimulatedRow> {
     let options = Options { seed, samples: 8 * seconds, targets: 1, ..Options::demo() };
     let rows = simulate(&options).rows;
-    let spells = rows.chunk_by(|one, next| next.time.duration_since(one.time).as_secs() == 1);
-    spells.max_by_key(|spell| spell.len()).expect("rows").iter().take(seconds).cloned().collect()
+    let walks = rows.chunk_by(|one, next| next.time.duration_since(one.time).as_secs() == 1);
+    walks.max_by_key(|walk| walk.len()).expect("rows").iter().take(seconds).cloned().collect()
 }
 
 fn box_json(row: &SimulatedRow) -> Value {
@@ -146,6 +146,33 @@ async fn a_false_box_is_answered_within_the_scene_by_every_recipe() {
         println!("{recipe}: {:.0} % inside, at most {farthest_m:.0} m off, {silent} silent", 100.0 * inside);
         assert!(inside >= 0.6 && farthest_m < 400.0, "{recipe}: {inside}, {farthest_m} m");
         assert_eq!(silent, 0, "{recipe}");
+    }
+}
+
+#[tokio::test]
+async fn a_track_of_false_boxes_states_a_radius_that_holds() {
+    let folder = data_folder();
+    let server = trained(folder.path(), "gaussian_process").await;
+    // Boxes alone, and beside fixes that are a kilometre off.
+    for target_id in ["alone", "gross"] {
+        let mut random = ChaCha8Rng::seed_from_u64(83);
+        let mut errors = Vec::new();
+        for row in &walk(83, 120) {
+            let seen = false_box(&mut random);
+            let mut observation = json!({"time": row.time, "target_id": target_id, "bounding_box": seen});
+            if target_id == "gross" {
+                observation["fix"] = fix_json(row);
+                observation["fix"]["latitude_deg"] = json!(row.truth.latitude_deg() + 0.009);
+            }
+            let answer = server.post("/v1/cameras/c/tracks", &observation).await.expect(200).json();
+            let item = &answer["items"][0];
+            if item["track"].is_object() {
+                errors.push(error_of(item, row));
+            }
+        }
+        let inside = share_inside(&errors);
+        println!("{target_id}: {:.0} % inside of {} s", 100.0 * inside, errors.len());
+        assert!(errors.len() > 60 && inside >= 0.88, "{target_id}: {inside}, {errors:.0?}");
     }
 }
 

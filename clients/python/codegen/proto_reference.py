@@ -35,7 +35,7 @@ MESSAGES, ENUMS, SERVICES = 4, 5, 6
 NESTED_MESSAGES, NESTED_ENUMS = 3, 4
 """Those of DescriptorProto."""
 MEMBERS = 2
-"""Of fields, enum values and methods in their parents."""
+"""Field number of fields, enum values and methods in their parents."""
 
 
 def descriptors(proto: Path) -> FileDescriptorSet:

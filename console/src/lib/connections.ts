@@ -29,6 +29,8 @@ export const KINDS: Kind[] = [
   receiver('nmea', 'connections.kind.nmea', ['tcp://receiver:4001', 'udp://0.0.0.0:10110', 'tcp-listen://0.0.0.0:10110', 'serial:///dev/ttyUSB0?baud=4800', MQTT], ['receiver_id']),
   receiver('gpsd', 'connections.kind.gpsd', ['gpsd://localhost:2947']),
   receiver('traccar', 'connections.kind.traccar', ['push:']),
+  receiver('phone', 'connections.kind.phone', ['push:', MQTT]),
+  sink('home-assistant', 'connections.kind.homeAssistant', 'home_assistant', [MQTT, 'mqtts://broker:8883'], ['topic', 'username', 'ca_certificate']),
   sink('mqtt', 'connections.kind.mqtt', 'json', [MQTT, 'mqtts://broker:8883'], ['topic', 'username', 'ca_certificate']),
   sink('kafka', 'connections.kind.kafka', 'json', [KAFKA, 'kafkas://broker:9093'], ['topic', 'username', 'ca_certificate']),
   sink('nats', 'connections.kind.nats', 'json', ['nats://localhost:4222'], ['topic', 'username']),

@@ -1,7 +1,7 @@
 // The targets of one camera as they are measured.
 import { cameraPath, get } from './api';
 import { listen } from './events';
-import type { BoundingBox, CameraMoved, FusedFix, Position, TrackFeature, TrackUpdate } from './types';
+import type { BoundingBox, CameraMoved, Fix, FusedFix, Position, TrackFeature, TrackUpdate } from './types';
 
 const TRAIL_POINTS = 120;
 /** A target that was not measured for this long is shown as lost. */
@@ -21,6 +21,7 @@ export interface LiveTarget {
   regressed: Position[];
   box?: BoundingBox;
   latest?: FusedFix;
+  latestFix?: Fix;
   heardAt_ms: number;
 }
 
@@ -85,7 +86,10 @@ export class Live {
     target.heardAt_ms = now_ms;
     if (update.properties.restarted) target.trail = [];
     push(target.trail, position);
-    if (update.fused?.gnss) push(target.fixes, update.fused.gnss);
+    if (update.fused?.gnss) {
+      target.latestFix = update.fused.gnss;
+      push(target.fixes, update.fused.gnss);
+    }
     if (update.fused?.regressed) push(target.regressed, update.fused.regressed);
     if (update.bounding_box) target.box = update.bounding_box;
     if (update.fused) target.latest = update.fused;

@@ -25,6 +25,12 @@ export function grpcurlLine(origin: string, camera: string, observation: TriedOb
   return `grpcurl ${plain}${needsKey ? KEY : ''}-d ${quoted({ camera_id: camera, observations: [observation] })} ${host} sightfix.v1.FusionService/Fuse`;
 }
 
+/** Starts the edge client for a camera. */
+export function edgeLine(origin: string, camera: string, needsKey: boolean): string {
+  const key = needsKey ? 'SIGHTFIX_API_KEY="$SIGHTFIX_KEY" ' : '';
+  return `${key}sightfix-edge --source rtsp://camera.example.org/stream --camera ${camera} --server ${origin}`;
+}
+
 /** Saves the camera's samples and replays them to it, with their times shifted to now. */
 export function replayLines(origin: string, camera: string, needsKey: boolean): string {
   const save = `curl -s ${needsKey ? KEY : ''}-H 'accept: text/csv' ${origin}/v1/cameras/${camera}/samples -o ${camera}.csv`;

@@ -59,6 +59,7 @@ export interface Camera {
   updated_at: string;
   samples: number;
   samples_without_fix: number;
+  location?: Position;
   gnss_bias_sigma_m?: number;
   active_model?: number;
   model_fault?: string;
@@ -71,6 +72,11 @@ export interface Learning {
   message: string;
   recorded_s: number;
   needed_s: number;
+  boxes: number;
+  fixes: number;
+  receivers: number;
+  last_attempt?: { time: string; outcome: string };
+  training_run?: string;
 }
 export interface CameraStatus {
   camera: Camera;
@@ -263,6 +269,19 @@ export interface TrackUpdate extends TrackFeature {
   bounding_box?: BoundingBox;
   fused?: FusedFix;
 }
+/** A box of a camera without a model. */
+export interface SeenBox {
+  time: string;
+  target_id?: string;
+  tracker_id?: string;
+  bounding_box: BoundingBox;
+  class?: string;
+  score?: number;
+}
+export interface ImagePoint {
+  x_px: number;
+  y_px: number;
+}
 export interface ErrorFigures {
   n: number;
   mean_m: number;
@@ -360,6 +379,7 @@ export interface ConnectionStatus {
   connects: number;
   queued: number;
   dead_letters: number;
+  reasons: { reason: string; count: number; example: string; last_at: string }[];
   lag_s?: number;
 }
 /** Where messages come from, or go to. */
@@ -369,9 +389,11 @@ export interface ConnectionSettings {
   topics?: string[];
   topic?: string;
   username?: string;
-  cameras?: Record<string, { camera_id: string }>;
+  cameras?: Record<string, { camera_id: string; area?: ImagePoint[] }>;
   camera_ids?: string[];
   receiver_id?: string;
+  classes?: string[];
+  least_score?: number;
   store_samples?: boolean;
   min_interval_s?: number;
 }

@@ -8,7 +8,7 @@ const LONG_DECADE_PX: f64 = 80.0;
 pub(crate) struct Axes<'a> {
     pub(crate) across: AxisSpec<'a>,
     pub(crate) upward: AxisSpec<'a>,
-    /// Whether a unit has the same length on both axes, which must be linear.
+    /// True if a unit has the same length on both axes, which must be linear.
     pub(crate) equal_scale: bool,
 }
 

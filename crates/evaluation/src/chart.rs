@@ -1,7 +1,7 @@
 //! Charts as self-contained SVG documents: no scripts, no embedded fonts, an opaque background, so that they
 //! are legible on light and dark pages.
 //!
-//! What lies outside of a frame is not drawn but counted, in the legend or in the title of its panel.
+//! Points outside a frame are not drawn but counted, in the legend or in the title of its panel.
 
 use std::fmt::Write as _;
 
@@ -26,7 +26,7 @@ const LEGEND_PX: f64 = 270.0;
 /// Height of a chart with one frame, px.
 const HEIGHT_PX: f64 = 540.0;
 
-/// Of more dots than this, evenly chosen ones are drawn; all are counted.
+/// The largest number of dots drawn. Of more dots, evenly chosen ones are drawn; all are counted.
 const MOST_DOTS: usize = 3_000;
 
 /// How points are drawn.
@@ -56,7 +56,7 @@ impl Series {
         Self { name: name.to_owned(), number: Some(number), points, shape }
     }
 
-    /// What is known: positions, or the ideal.
+    /// A series of known values: positions, or the ideal.
     pub(crate) fn truth(name: &str, points: Vec<[f64; 2]>, shape: Shape) -> Self {
         Self { name: name.to_owned(), number: None, points, shape }
     }
@@ -221,7 +221,7 @@ fn draw_series(svg: &mut String, series: &Series, frame: &Frame) {
         is_drawing = is_drawn;
     }
     let (colour, dashes) = (series.colour(), series.dashes());
-    // What is known is thin, so that it hides nothing of what it is compared with.
+    // Known values are thin, so that they hide nothing of what they are compared with.
     let is_truth = series.number.is_none();
     let style = match series.shape {
         Shape::Dots if is_truth => "stroke-width=\"1.2\" stroke-linecap=\"round\"".to_owned(),

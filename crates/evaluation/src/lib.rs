@@ -19,6 +19,7 @@ pub(crate) mod axis;
 pub mod baselines;
 pub(crate) mod chart;
 mod metrics;
+mod model_fits;
 mod options;
 pub mod paper_experiments;
 pub(crate) mod plots;
@@ -30,7 +31,6 @@ pub mod site;
 #[cfg(test)]
 mod tests;
 mod traces;
-mod training;
 mod truth;
 
 pub use crate::domain::{Method, Truth};

@@ -177,7 +177,7 @@ mod tests {
         assert!((metrics.coverage95.expect("stated") - 0.95).abs() < 0.006, "{metrics:?}");
         assert!((metrics.coverage50.expect("stated") - 0.5).abs() < 0.015, "{metrics:?}");
         assert!(near(metrics.mean_r95_m.expect("stated"), 2.447_746_8));
-        // Of sigma 1 the expectation is ln(tau) + 1; every other radius scores worse.
+        // For sigma 1 the expectation is ln(tau) + 1; every other radius scores worse.
         let score = metrics.negative_log_likelihood.expect("stated");
         assert!((score - TAU.ln() - 1.0).abs() < 0.02, "{score}");
         for factor in [0.8, 1.25] {

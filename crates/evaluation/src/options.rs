@@ -1,4 +1,4 @@
-//! What an evaluation is asked to do, and how far it has come.
+//! The options and the progress of an evaluation.
 
 use crate::domain::{GnssBiasSigma, ImageSize, Method, Observation, Recipe, SigmaM};
 use crate::geo::Position;

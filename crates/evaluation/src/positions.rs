@@ -1,4 +1,4 @@
-//! The positions behind a report's figures, for maps and charts.
+//! The positions from which a report's figures are computed, for maps and charts.
 
 use std::collections::BTreeMap;
 

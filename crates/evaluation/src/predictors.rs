@@ -1,8 +1,8 @@
 //! The predictor of every method: from the rows of one target to positions.
 
 use super::baselines::{dnn, homography, imm_ukf};
+use super::model_fits::RecipeModel;
 use super::options::{EvaluateOptions, TestRow};
-use super::training::RecipeModel;
 use crate::domain::{BoundingBox, InferenceMode, Method, Observation, SigmaM};
 use crate::filters::ImmUkf;
 use crate::fusion::observed::UNKNOWN_RECEIVER_M2;
@@ -35,7 +35,7 @@ pub(super) type TargetRows = Vec<usize>;
 /// Predicts a position for each of one target's rows, in their order; `None` where the method cannot.
 pub(super) type Predictor<'a> = Box<dyn FnMut(&TargetRows) -> Vec<Option<Prediction>> + 'a>;
 
-/// What the predictors of one evaluation have in common.
+/// The state that the predictors of one evaluation share.
 #[derive(Clone, Copy)]
 pub(super) struct Predictors<'a> {
     pub(super) train: FitInput<'a>,

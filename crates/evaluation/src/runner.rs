@@ -5,11 +5,11 @@ use std::ops::ControlFlow;
 use std::time::Instant;
 
 use super::metrics::{ErrorMetrics, ScoredPrediction};
+use super::model_fits::{RecipeModel, Timed, fit_recipe, recipes_of};
 use super::options::{EvaluateOptions, Progress, TestRow};
 use super::predictors::{Prediction, Predictor, Predictors, TargetRows};
 use super::report::MethodReport;
 use super::traces::{Curve, Evaluation, Trace, TracePoint};
-use super::training::{RecipeModel, Timed, fit_recipe, recipes_of};
 use super::truth::error_m;
 use crate::domain::{Method, Result, Sample, Truth};
 use crate::geo::{LocalPlane, Position};

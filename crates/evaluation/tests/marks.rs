@@ -16,7 +16,7 @@ use sightfix_fusion::target_track::TargetTrack;
 use sightfix_fusion::track::TrackSettings;
 use sightfix_fusion::two_step::fuse_observed;
 use sightfix_model::{FitOptions, R95_PER_SIGMA, Regressor, fit};
-use sightfix_simulation::{Options, Route, Scene, SimulatedRow, World, simulate_split};
+use sightfix_simulation::{Options, Route, Scene, SimulatedRow, TargetShape, World, simulate_split};
 
 /// Worlds on which nothing was chosen.
 const WORLDS: Range<u64> = 201..209;
@@ -180,6 +180,45 @@ fn people_whose_feet_are_hidden() {
     let (whole, some) = (&shares["none hidden"], &shares["in a tenth of the rows 20 to 60 % hidden"]);
     assert!(some.0.mean_m() <= 1.3 * whole.0.mean_m() && some.0.inside() >= 0.88);
     assert!(some.1.mean_m() <= 1.3 * whole.1.mean_m() && some.1.inside() >= 0.88);
+    let fifth = &shares["20 % hidden"];
+    assert!(fifth.0.inside() >= 0.85 && fifth.1.inside() >= 0.75);
+}
+
+/// A large aircraft 12 m beside the lines of training.
+#[test]
+#[ignore = "takes minutes"]
+fn a_line_that_was_never_walked() {
+    let (mut fused, mut tracked, mut gnss) = (Errors::default(), Errors::default(), Errors::default());
+    for seed in WORLDS {
+        let options = Options {
+            seed,
+            camera_seed: seed,
+            samples: 4_000,
+            gnss_sigma_m: 8.0,
+            target_shape: Some(TargetShape {
+                length_m: 37.0,
+                width_m: 34.0,
+                height_m: 12.0,
+                antenna_ahead_m: 14.0,
+                antenna_left_m: 0.0,
+            }),
+            ..Options::new(Scene::Airport)
+        };
+        let (training, _) = simulate_split(&options, 1);
+        let test = Options { route: Route::NewLine, new_line_offset_m: Some(12.0), ..options.clone() };
+        let (_, test) = simulate_split(&test, 600);
+        let mut camera = Camera::trained(&training, Some(8.0));
+        for (row, bounding_box, fix) in complete(&test) {
+            gnss.add(fix.position, row, 8.0 * R95_PER_SIGMA);
+            camera.observe(row, bounding_box, Some(fix), true);
+        }
+        println!("{seed}: two-step {}; track {}", camera.fused.text(), camera.tracked.text());
+        fused.0.append(&mut camera.fused.0);
+        tracked.0.append(&mut camera.tracked.0);
+    }
+    println!("GNSS {}; two-step {}; track {}", gnss.text(), fused.text(), tracked.text());
+    assert!(fused.mean_m() <= 0.5 * gnss.mean_m() && tracked.mean_m() <= fused.mean_m());
+    assert!(fused.inside() >= 0.8 && tracked.inside() >= 0.75);
 }
 
 /// A box of any size anywhere in the image.
@@ -207,9 +246,15 @@ fn boxes_that_are_wrong() {
             let options = Options { seed, camera_seed: seed, samples: 1_500, ..Options::new(scene) };
             let (training, test) = simulate_split(&options, 600);
             let mut camera = Camera::trained(&training, Some(options.gnss_sigma_m));
-            for case in
-                ["none", "frozen", "25 % false", "all false", "all false, gross fixes", "all false, no fix"]
-            {
+            for case in [
+                "none",
+                "no box",
+                "frozen",
+                "25 % false",
+                "all false",
+                "all false, gross fixes",
+                "all false, no fix",
+            ] {
                 camera.forget();
                 let mut random = ChaCha8Rng::seed_from_u64(seed);
                 let (mut begin, mut frozen) = (None, None);
@@ -242,9 +287,10 @@ fn boxes_that_are_wrong() {
         for (case, (fused, tracked)) in &cases {
             println!("{scene:?}, {case}: two-step {}; track {}", fused.text(), tracked.text());
         }
-        for case in ["none", "frozen", "25 % false", "all false"] {
-            let (fused, tracked) = &cases[case];
-            assert!(fused.inside() >= 0.85 && tracked.inside() >= 0.85, "{scene:?}, {case}");
+        for (case, (fused, tracked)) in &cases {
+            // The boxes of a vehicle count until the picture is known to be frozen.
+            let mark = if *case == "frozen" { 0.85 } else { 0.88 };
+            assert!(fused.inside() >= mark && tracked.inside() >= mark, "{scene:?}, {case}");
         }
     }
 }

@@ -55,7 +55,7 @@ impl Scheme {
         Self::Https,
         Self::File,
     ];
-    /// What is complete without an address.
+    /// The schemes that are complete without an address.
     const BARE: [Self; 2] = [Self::Push, Self::File];
     /// Kinds whose messages have topics that are subscribed to.
     const SUBSCRIBED: [Self; 4] = [Self::Mqtt, Self::Mqtts, Self::Kafka, Self::Kafkas];
@@ -96,12 +96,17 @@ impl Scheme {
         }
     }
 
-    /// Whether a source of this kind subscribes to topics.
+    /// True if a source of this kind subscribes to topics.
     pub(super) fn subscribes(self) -> bool {
         Self::SUBSCRIBED.contains(&self)
     }
 
-    /// Whether it is Kafka, plain or encrypted.
+    /// True if it is MQTT, plain or encrypted.
+    pub(super) const fn is_mqtt(self) -> bool {
+        matches!(self, Self::Mqtt | Self::Mqtts)
+    }
+
+    /// True if it is Kafka, plain or encrypted.
     pub(super) const fn is_kafka(self) -> bool {
         matches!(self, Self::Kafka | Self::Kafkas)
     }
@@ -114,7 +119,7 @@ pub struct Address {
     pub scheme: Scheme,
     /// Name or address of its machine; without the brackets of IPv6.
     pub host: String,
-    /// Its port.
+    /// The port of that host.
     pub port: u16,
     /// Further machines of a cluster of Kafka, each with its port.
     pub others: Vec<(String, u16)>,

@@ -27,12 +27,13 @@ pub(super) const CLASS: usize = 9;
 pub(super) const SCORE: usize = 10;
 pub(super) const TRUTH_LONGITUDE: usize = 11;
 pub(super) const TRUTH_LATITUDE: usize = 12;
+pub(super) const TRACKER_ID: usize = 13;
 pub(super) const RECEIVER_ID: usize = 15;
-/// Number of columns of a file of fixes.
+/// Number of columns of a file of fixes, or of live items.
 pub(super) const COUNT: usize = 16;
 /// Number of columns of a file of samples, observations or detections: the first of all.
 pub(super) const OF_SAMPLES: usize = 15;
-/// Of these, the columns of samples that were not matched: the last two say how a sample was.
+/// Number of columns of samples that were not matched: the last two say how a sample was.
 pub(super) const OF_UNMATCHED: usize = 13;
 
 /// All columns, in the order of writing.

@@ -12,7 +12,7 @@ use super::address::{Address, Scheme};
 use super::messages::{JsonMapping, MessageFormat};
 use super::track_files::TrackFileFormat;
 use crate::domain::{
-    CameraId, Error, ImageSize, ReceiverId, Result, Score, TargetClass, TargetId, check_text,
+    CameraId, Error, ImageArea, ImageSize, ReceiverId, Result, Score, TargetClass, TargetId, check_text,
 };
 
 /// Cameras that a connection may name.
@@ -32,7 +32,7 @@ pub struct ConnectionDraft {
     /// The name for people; the id if left out.
     #[schema(max_length = 200)]
     pub display_name: Option<String>,
-    /// Whether it stays at rest.
+    /// True if the connection stays paused.
     #[serde(default)]
     pub paused: bool,
     /// Takes detections or fixes in.
@@ -45,7 +45,7 @@ pub struct ConnectionDraft {
     pub secrets: BTreeMap<String, Option<String>>,
 }
 
-/// What a connection does: exactly one of both.
+/// The settings of a source or of a sink: exactly one of both.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ConnectionSettings {
@@ -58,7 +58,7 @@ pub struct ConnectionSettings {
 }
 
 /// A camera of this server, by the sender's name of it.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CameraMapping {
     /// The camera here.
@@ -67,15 +67,30 @@ pub struct CameraMapping {
     /// Size of the stream that the sender's boxes are in, if it is not the camera's `image_size`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image_size: Option<StreamSize>,
+    /// Corners of the part of the camera's image whose boxes are taken: those whose foot, the middle of the lower edge, is
+    /// inside. All boxes are taken if it is left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(min_items = 3, max_items = 64)]
+    pub area: Option<Vec<ImagePoint>>,
+}
+
+/// A point of an image.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ImagePoint {
+    /// Px from the left border.
+    pub x_px: f64,
+    /// Px from the upper border.
+    pub y_px: f64,
 }
 
 /// Size of a stream, px.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StreamSize {
-    /// Width, px.
+    /// Width of the image, px.
     pub width_px: u32,
-    /// Height, px.
+    /// Height of the image, px.
     pub height_px: u32,
 }
 
@@ -93,7 +108,7 @@ pub enum SaslMechanism {
     ScramSha512,
 }
 
-/// What names the receiver of fixes whose messages name none.
+/// The origin of the receiver's name if a message does not contain one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ReceiverFrom {
@@ -124,7 +139,7 @@ pub struct SourceSettings {
     /// `POST /v1/connections/{connection}/messages`.
     #[schema(max_length = 512, example = "mqtt://broker.example.org:1883")]
     pub address: String,
-    /// What the messages are.
+    /// The format of the messages.
     pub format: MessageFormat,
     /// Topics of MQTT, with its wildcards, or of Kafka.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -150,7 +165,7 @@ pub struct SourceSettings {
     /// The receiver of fixes whose messages name none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub receiver_id: Option<String>,
-    /// What names the receiver of fixes whose messages name none.
+    /// The origin of the receiver's name if a message does not contain one.
     #[serde(default, skip_serializing_if = "ReceiverFrom::is_connection")]
     pub receiver_from: ReceiverFrom,
     /// Where the values of messages of the format `json` are.
@@ -164,11 +179,11 @@ pub struct SourceSettings {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.0, maximum = 1.0)]
     pub least_score: Option<f64>,
-    /// Whether the ids of detected objects are names of targets, which receivers know, too. They are numbers of a tracker if
-    /// left out, and boxes are then matched with receivers by where they are.
+    /// True if the ids of detected objects are names of targets, which receivers also use. If left out, they are
+    /// numbers of a tracker, and boxes are matched with receivers by their positions.
     #[serde(default)]
     pub ids_name_targets: bool,
-    /// Whether boxes and fixes are paired and stored as samples. The peer's messages are acknowledged when that is done.
+    /// True if boxes and fixes are paired and stored as samples. Messages are acknowledged when that is done.
     #[serde(default)]
     pub store_samples: bool,
 }
@@ -184,6 +199,9 @@ pub enum OutgoingFormat {
     Cot,
     /// An ONVIF metadata frame (XML, `tt:MetadataStream`) with the object's geolocation per position.
     Onvif,
+    /// Attributes of device trackers of Home Assistant, which are announced to it by MQTT discovery; of targets whose receiver is
+    /// known alone. For addresses of MQTT.
+    HomeAssistant,
     /// Tracks in files of GPX 1.1, for the address `file:`.
     Gpx,
     /// Tracks in files of KML 2.2, for the address `file:`.
@@ -195,7 +213,7 @@ impl OutgoingFormat {
     #[must_use]
     pub const fn track_file(self) -> Option<TrackFileFormat> {
         match self {
-            Self::Json | Self::Cot | Self::Onvif => None,
+            Self::Json | Self::Cot | Self::Onvif | Self::HomeAssistant => None,
             Self::Gpx => Some(TrackFileFormat::Gpx),
             Self::Kml => Some(TrackFileFormat::Kml),
         }
@@ -211,7 +229,7 @@ pub struct SinkSettings {
     /// `export_folder`.
     #[schema(max_length = 512, example = "https://hooks.example.org/positions")]
     pub address: String,
-    /// What is sent.
+    /// The format of the messages that are sent.
     #[serde(default)]
     pub format: OutgoingFormat,
     /// Topic of MQTT or Kafka, or subject of NATS; `{camera}` and `{target}` are replaced by their ids.
@@ -314,7 +332,7 @@ impl Secrets {
     }
 }
 
-/// Whether a text can be sent as the value of a header as it is (RFC 9110, 5.5).
+/// True if a text is valid as the value of a header (RFC 9110, 5.5).
 fn is_header(text: &str) -> bool {
     text.trim() == text && text.bytes().all(|byte| matches!(byte, b' '..=b'~'))
 }
@@ -359,7 +377,7 @@ impl ConnectionSettings {
         Ok(named)
     }
 
-    /// Whether the peer is the same as by other settings: direction, scheme, hosts and ports.
+    /// True if the peer is the same as by other settings: direction, scheme, hosts and ports.
     #[must_use]
     pub fn has_peer_of(&self, other: &Self) -> bool {
         self.peer().is_some_and(|peer| other.peer() == Some(peer))
@@ -405,7 +423,7 @@ impl SourceSettings {
             }
             if self.ids_name_targets {
                 let rule =
-                    "is for detections; whose a receiver is stands in the profile of the camera (receivers)";
+                    "is for detections; the profile of the camera (receivers) says whose a receiver is";
                 return Err(Error::invalid("ids_name_targets", rule));
             }
         }
@@ -420,14 +438,15 @@ impl SourceSettings {
         for (name, mapping) in &self.cameras {
             let checked = || {
                 mapping.camera()?;
-                mapping.stream_size().map(drop)
+                mapping.stream_size()?;
+                mapping.area().map(drop)
             };
             checked().map_err(|error: Error| error.under(&format!("cameras.{name}")))?;
         }
         Ok(())
     }
 
-    /// Whether its messages contain fixes, not detections.
+    /// True if its messages contain fixes, not detections.
     fn brings_fixes(&self) -> bool {
         self.mapping.as_ref().map_or_else(|| self.format.brings_fixes(), JsonMapping::brings_fixes)
     }
@@ -452,7 +471,7 @@ impl SourceSettings {
         Ok(())
     }
 
-    /// Whether a message may name a camera that the settings do not: then the name is the id of a camera.
+    /// True if a message may name a camera that the settings do not: then the name is the id of a camera.
     #[must_use]
     pub fn names_any_camera(&self) -> bool {
         !self.brings_fixes() && !self.cameras.contains_key("*")
@@ -491,6 +510,15 @@ impl CameraMapping {
     pub fn stream_size(&self) -> Result<Option<ImageSize>> {
         self.image_size.map(|size| ImageSize::new(size.width_px, size.height_px)).transpose()
     }
+
+    /// The part of the camera's image whose boxes are taken, if it is not all of it.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `area`.
+    pub fn area(&self) -> Result<Option<ImageArea>> {
+        let corners = |area: &Vec<ImagePoint>| area.iter().map(|point| [point.x_px, point.y_px]).collect();
+        self.area.as_ref().map(|area| ImageArea::new(corners(area))).transpose()
+    }
 }
 
 impl SinkSettings {
@@ -510,6 +538,9 @@ impl SinkSettings {
                 "format",
                 "must be gpx or kml for the address file:, and for no other",
             ));
+        }
+        if self.format == OutgoingFormat::HomeAssistant && !scheme.is_mqtt() {
+            return Err(Error::invalid("format", "can be home_assistant for addresses of MQTT alone"));
         }
         check_username(self.username.as_deref())?;
         check_sasl(self.sasl_mechanism, scheme, self.username.as_deref())?;
@@ -573,7 +604,7 @@ impl SinkSettings {
     }
 }
 
-/// What names of topics may have in Kafka.
+/// The rule for names of topics in Kafka.
 const KAFKA_TOPIC_RULE: &str = "must be 1 to 249 letters, digits, dots, hyphens and underscores for Kafka";
 
 const fn is_kafka_character(it: char) -> bool {

@@ -10,7 +10,7 @@ use crate::domain::{Error, ErrorKind, Result};
 const GROUPS: [&[usize]; 3] =
     [&[LEFT, LEFT + 1, LEFT + 2, HEIGHT], &[LONGITUDE, LATITUDE], &[TRUTH_LONGITUDE, TRUTH_LATITUDE]];
 
-/// What helps with a file of other columns than the documented ones.
+/// Advice for a file of other columns than the documented ones.
 const AUTO_HINT: &str =
     "; with `columns` as `auto` the usual names of columns are found, and other columns are ignored";
 

@@ -22,7 +22,7 @@ use crate::domain::{Error, ImageSize, Result, TargetId};
 pub struct CsvLayout {
     /// Which columns hold the values.
     pub columns: ColumnNames,
-    /// What the sides of a box are; derived from the names of the columns if `None`.
+    /// The meaning of the sides of a box; derived from the names of the columns if `None`.
     pub box_form: Option<BoxForm>,
     /// The unit of the sides.
     pub box_unit: BoxUnit,
@@ -44,7 +44,7 @@ pub enum ColumnNames {
     Given(Vec<(usize, String)>),
 }
 
-/// What the four columns of a box hold.
+/// The meaning of the four columns of a box.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, EnumString, IntoStaticStr, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_box_form)]
@@ -64,7 +64,7 @@ pub enum BoxForm {
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_box_unit)]
 pub enum BoxUnit {
-    /// Pixels.
+    /// The sides are in pixels.
     #[default]
     Px,
     /// Shares of the image's width and height, 0 to 1.
@@ -114,7 +114,7 @@ impl CsvLayout {
         Self { columns, box_form, box_unit: box_unit.unwrap_or_default(), ..Self::default() }
     }
 
-    /// Whether the file is as documented.
+    /// True if the file has the documented columns.
     #[must_use]
     pub fn is_documented(&self) -> bool {
         self.columns == ColumnNames::Documented
@@ -126,7 +126,7 @@ impl CsvLayout {
             return ',';
         }
         let count = |separator: &char| header.matches(*separator).count();
-        // Of equals the last.
+        // Among equals the last.
         ['|', ',', '\t', ';'].into_iter().max_by_key(count).unwrap_or(',')
     }
 
@@ -154,7 +154,7 @@ impl CsvLayout {
         ranked.min().map(|(_, at)| at)
     }
 
-    /// What the boxes' columns hold, by the names of the columns of `left` and `width`.
+    /// Returns the meaning of the boxes' columns, by the names of the columns of `left` and `width`.
     pub(super) fn form(&self, name_of: impl Fn(usize) -> Option<String>) -> BoxForm {
         let name = |field| name_of(field).map(|name| bare(&name)).unwrap_or_default();
         match self.box_form {

@@ -9,7 +9,7 @@ use jiff::tz::TimeZone;
 
 use super::columns::{
     CLASS, COUNT, HEIGHT, LATITUDE, LEFT, LONGITUDE, OF_SAMPLES, RECEIVER_ID, SCORE, SIGMA, TARGET_ID, TIME,
-    TOP, TRUTH_LATITUDE, TRUTH_LONGITUDE, WIDTH,
+    TOP, TRACKER_ID, TRUTH_LATITUDE, TRUTH_LONGITUDE, WIDTH,
 };
 use super::csv_header::Header;
 use super::csv_layout::{BoxForm, CsvLayout};
@@ -33,7 +33,7 @@ struct ValueRules {
     is_documented: bool,
     has_decimal_comma: bool,
     box_form: BoxForm,
-    /// What the sides of boxes are multiplied by, in x and y.
+    /// The factors of the sides of boxes, in x and y.
     scale_px: [f64; 2],
     timezone: Option<TimeZone>,
 }
@@ -51,11 +51,11 @@ impl<R: Read> CsvRows<R> {
         Self::with_columns(reader, required, OF_SAMPLES, layout, scale_px)
     }
 
-    /// Rows of a file of fixes, which may have a receiver column.
+    /// Rows of a file of fixes or live items, which may have a receiver column.
     ///
     /// # Errors
     /// As [`CsvRows::new`].
-    pub(super) fn of_fixes(reader: R, required: &[usize], layout: &CsvLayout) -> Result<Self> {
+    pub(super) fn with_receivers(reader: R, required: &[usize], layout: &CsvLayout) -> Result<Self> {
         Self::with_columns(reader, required, COUNT, layout, [1.0, 1.0])
     }
 
@@ -195,7 +195,7 @@ impl<'a> CsvCells<'a> {
             truth: self
                 .numbers([TRUTH_LONGITUDE, TRUTH_LATITUDE])?
                 .map(|[longitude_deg, latitude_deg]| wire::Position { longitude_deg, latitude_deg }),
-            _tracker_id: None,
+            tracker_id: self.name(TRACKER_ID),
             _match_probability: None,
             receiver_id: self.name(RECEIVER_ID),
         })

@@ -12,7 +12,7 @@ use crate::domain::{
 /// Largest accepted cursor, bytes.
 const MAX_BYTES: usize = 512;
 
-/// The key of the last item of a page, behind which the next page begins.
+/// The key of the last item of a page, after which the next page begins.
 pub trait Cursor: Sized {
     /// Name of the list, so that no list takes the cursor of another.
     const LIST: &'static str;

@@ -80,7 +80,7 @@ impl<'a> Feature<'a> {
             class,
             score,
             truth,
-            _tracker_id: None,
+            tracker_id: None,
             _match_probability: None,
             receiver_id: None,
         })

@@ -12,7 +12,7 @@ pub struct RowError {
     pub line: u64,
     /// Column, or path of the field in the row's JSON; empty if the row as a whole is invalid.
     pub field: String,
-    /// What is wrong and what is valid.
+    /// States the fault and the valid values.
     pub reason: String,
 }
 
@@ -50,13 +50,13 @@ pub(super) struct FileRow<'a> {
     pub class: Option<Text<'a>>,
     pub score: Option<f64>,
     pub truth: Option<wire::Position>,
-    /// With `match_probability`, what `sightfix pair --match` says about its samples; not stored.
-    #[serde(borrow, rename = "tracker_id")]
-    pub _tracker_id: Option<Text<'a>>,
+    /// Of a live item; beside `match_probability` what `sightfix pair --match` says about its samples, which is not stored.
+    #[serde(borrow)]
+    pub tracker_id: Option<Text<'a>>,
     #[serde(rename = "match_probability")]
     pub _match_probability: Option<f64>,
-    /// Only CSV files of fixes have it.
-    #[serde(skip)]
+    /// Only fixes and live items have it.
+    #[serde(borrow)]
     pub receiver_id: Option<Text<'a>>,
 }
 

@@ -1,4 +1,4 @@
-//! What receivers say of the quality of a fix, as its standard deviation per axis. One mapping for files and messages.
+//! The quality of a fix as receivers state it, as its standard deviation per axis. One mapping for files and messages.
 //!
 //! The most direct statement wins: standard deviations (GST), then estimated errors in metres (gpsd, Traccar, AIS), then
 //! the kind of solution with its dilution of precision (GGA, GPX). A fix without any of them has no standard deviation
@@ -52,24 +52,29 @@ impl Solution {
     }
 }
 
-/// Of standard deviations per axis, m.
+/// The sigma of standard deviations per axis, m.
 pub(super) fn sigma_of_deviations(east_m: f64, north_m: f64) -> Option<SigmaM> {
     stated((east_m * east_m + north_m * north_m).sqrt() / std::f64::consts::SQRT_2)
 }
 
-/// Of errors per axis that are exceeded in 5 of 100 cases, m.
+/// The sigma of errors per axis that are exceeded in 5 of 100 cases, m.
 pub(super) fn sigma_of_intervals_95(east_m: f64, north_m: f64) -> Option<SigmaM> {
     sigma_of_deviations(east_m / INTERVAL_95, north_m / INTERVAL_95)
 }
 
-/// Of a radius that contains the target in 95 of 100 cases, m.
+/// The sigma of a radius that contains the target in 95 of 100 cases, m.
 pub(super) fn sigma_of_radius_95(radius_m: f64) -> Option<SigmaM> {
     stated(radius_m / RADIUS_95)
 }
 
-/// Of a radius that contains the target in 68 of 100 cases, m.
+/// The sigma of a radius that contains the target in 68 of 100 cases, m.
 pub(super) fn sigma_of_radius_68(radius_m: f64) -> Option<SigmaM> {
     stated(radius_m / RADIUS_68)
+}
+
+/// Radius that contains a circular normal error of this variance per axis, m2, in 68 of 100 cases, m.
+pub(super) fn radius_68_m(variance_m2: f64) -> f64 {
+    RADIUS_68 * variance_m2.sqrt()
 }
 
 /// 0 and what is not a number mean that nothing is known. What no receiver can know is the nearest that is possible.

@@ -13,6 +13,7 @@ use super::format::FixFormat;
 use super::gpsd::GpsdFixes;
 use super::gpx::GpxFixes;
 use super::nmea_fixes::NmeaFixes;
+use super::rtklib::RtklibFixes;
 use crate::domain::{Error, Fix, ReceivedFix, ReceiverId, Result, TimeBounds, parse_time};
 
 /// A fix, and its time if the file has it.
@@ -64,18 +65,20 @@ enum FixRows<R> {
     Nmea(NmeaFixes<R>),
     Gpx(Box<GpxFixes<R>>),
     Gpsd(GpsdFixes<R>),
+    Rtklib(RtklibFixes<R>),
 }
 
 impl<R: Read> FixRows<R> {
     fn new(reader: R, laid_out: &LaidOut<FixFormat>, time_bounds: TimeBounds) -> Result<Self> {
         Ok(match laid_out.format {
             FixFormat::Csv => {
-                let rows = CsvRows::of_fixes(reader, &[LONGITUDE, LATITUDE], &laid_out.layout)?;
+                let rows = CsvRows::with_receivers(reader, &[LONGITUDE, LATITUDE], &laid_out.layout)?;
                 Self::Csv { rows, time_bounds, receiver_id: None }
             }
             FixFormat::Nmea => Self::Nmea(NmeaFixes::new(reader, time_bounds)),
             FixFormat::Gpx => Self::Gpx(Box::new(GpxFixes::new(reader, time_bounds))),
             FixFormat::Gpsd => Self::Gpsd(GpsdFixes::new(reader, time_bounds)),
+            FixFormat::Rtklib => Self::Rtklib(RtklibFixes::new(reader, time_bounds)),
         })
     }
 
@@ -89,6 +92,7 @@ impl<R: Read> FixRows<R> {
             Self::Nmea(rows) => rows.next_row(),
             Self::Gpx(rows) => rows.next_row(),
             Self::Gpsd(rows) => rows.next_row(),
+            Self::Rtklib(rows) => rows.next_row(),
         }
     }
 }

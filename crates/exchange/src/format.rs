@@ -76,6 +76,8 @@ pub enum FixFormat {
     Gpx,
     /// Reports of gpsd, one per line (`gpspipe -w`): those of class TPV. The receiver is the `device`.
     Gpsd,
+    /// Solutions of RTKLIB (`.pos`) in degrees, with times of GPS, UTC or Japan.
+    Rtklib,
 }
 
 impl FixFormat {
@@ -91,6 +93,7 @@ impl FixFormat {
             "csv" => Some(Self::Csv),
             "nmea" | "log" | "txt" => Some(Self::Nmea),
             "gpx" => Some(Self::Gpx),
+            "pos" => Some(Self::Rtklib),
             "json" | "ndjson" | "jsonl" => Some(Self::Gpsd),
             _ => None,
         }
@@ -104,6 +107,7 @@ impl FixFormat {
             "text/csv" => Some(Self::Csv),
             "application/nmea" | "application/x-nmea" | "text/x-nmea" | "text/plain" => Some(Self::Nmea),
             "application/gpx+xml" => Some(Self::Gpx),
+            "text/x-rtklib" => Some(Self::Rtklib),
             "application/json" | "application/x-ndjson" | "application/ndjson" | "application/jsonl" => {
                 Some(Self::Gpsd)
             }
@@ -119,5 +123,5 @@ impl FixFormat {
 }
 
 fn unknown_fix_format(_: &str) -> Error {
-    Error::invalid("format", "must be one of csv, nmea, gpx, gpsd")
+    Error::invalid("format", "must be one of csv, nmea, gpx, gpsd, rtklib")
 }

@@ -49,7 +49,7 @@ impl FrameClock {
         Err(Error::invalid("frame_rate", "must be above 0 and at most 1000 frames per second"))
     }
 
-    /// The time of the frame so many frames after the first.
+    /// The time of the frame that comes `frames` frames after the first.
     fn time_of(&self, frames: u32) -> Result<Timestamp> {
         let time =
             self.start.checked_add(SignedDuration::from_secs_f64(f64::from(frames) / self.frames_per_s));
@@ -60,7 +60,7 @@ impl FrameClock {
 /// The boxes of a file, in its order.
 ///
 /// # Errors
-/// Of an item: the file cannot be read further; nothing follows. The inner error: that line is invalid.
+/// An item is an error if the file cannot be read further; nothing follows. The inner error: that line is invalid.
 pub fn read_frame_file<R: Read>(
     reader: R,
     format: FrameFileFormat,

@@ -16,7 +16,7 @@ use super::fix_quality::{
     sigma_of_radius_95,
 };
 use super::fix_row::FixRow;
-use super::lines::{Line, Lines};
+use super::lines::Lines;
 use super::wire::{self, Text};
 use crate::domain::{Error, ReceiverId, Result, SigmaM, TimeBounds, parse_time};
 
@@ -90,15 +90,10 @@ impl<R: Read> GpsdFixes<R> {
 
     pub(super) fn next_row(&mut self) -> Option<Result<Result<FixRow, RowError>>> {
         loop {
-            let (line, text) = match self.lines.next_line() {
-                Err(error) => return Some(Err(Error::fault(error))),
-                Ok(None) => return None,
-                Ok(Some(read)) => read,
-            };
-            let text = match text {
-                Line::Text(text) => text.trim(),
-                Line::NotUtf8 => return Some(Ok(Err(RowError::whole(line, "is not UTF-8")))),
-                Line::TooLong => return Some(Ok(Err(RowError::whole(line, "is longer than 64 KiB")))),
+            let (line, text) = match self.lines.next_text().transpose()? {
+                Err(error) => return Some(Err(error)),
+                Ok((_, Err(row))) => return Some(Ok(Err(row))),
+                Ok((line, Ok(text))) => (line, text),
             };
             if text.is_empty() {
                 continue;
@@ -139,7 +134,7 @@ impl Reports {
         self.of_device(report).state(second_of_day(time), sigma);
     }
 
-    /// What is known of the report's device. Of several devices, only that of the latest report is remembered.
+    /// The stated deviations of the report's device. Of several devices, only that of the latest report is remembered.
     fn of_device(&mut self, report: &GpsdReport<'_>) -> &mut StatedDeviations<Option<u8>> {
         let device = report.device.as_ref().map(Text::as_str);
         if self.device.as_deref() != device {

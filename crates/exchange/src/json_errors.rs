@@ -1,4 +1,4 @@
-//! What is wrong with a JSON document, in the words of its interface and not of the parser's language.
+//! The faults of a JSON document, in the words of its interface and not of the parser's language.
 
 use crate::domain::{Error, ErrorKind};
 
@@ -74,7 +74,7 @@ fn type_mismatch(what: &str) -> Option<String> {
     })
 }
 
-/// What JSON calls a value that the parser describes by a type or a sample.
+/// The JSON type of a value that the parser describes by a type or a sample.
 fn json_type(described: &str) -> String {
     let first = described.split([' ', '`', '"']).next().unwrap_or_default();
     let name = match first {

@@ -98,7 +98,7 @@ impl Fault {
         !target.is_empty() && replace::<T>(document, &target)
     }
 
-    /// Whether it is at or below a value, or says that the value is missing.
+    /// True if it is at or below a value, or says that the value is missing.
     fn is_within(&self, target: &[Step]) -> bool {
         let is_missing = || match target {
             [parents @ .., Step::Field(name)] => {

@@ -16,7 +16,7 @@
 //! | [`Cursor`] | the key after which the next page of a list begins, as text |
 
 #![warn(missing_docs)]
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod address;
@@ -37,6 +37,7 @@ mod formula_guard;
 mod frame_files;
 mod gpsd;
 mod gpx;
+mod home_assistant;
 mod json_errors;
 mod json_violations;
 mod lines;
@@ -46,6 +47,7 @@ mod objects_only;
 mod outgoing;
 mod recording;
 mod rows;
+mod rtklib;
 mod source_decoder;
 #[cfg(test)]
 mod tests;
@@ -56,8 +58,8 @@ mod write;
 
 pub use address::{Address, Scheme, SerialLine, bracketed};
 pub use connection::{
-    CameraMapping, ConnectionDraft, ConnectionSettings, OutgoingFormat, ReceiverFrom, SaslMechanism, Secrets,
-    SinkSettings, SourceSettings,
+    CameraMapping, ConnectionDraft, ConnectionSettings, ImagePoint, OutgoingFormat, ReceiverFrom,
+    SaslMechanism, Secrets, SinkSettings, SourceSettings,
 };
 pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};
 pub use cursor::{Cursor, read_cursor, write_cursor};
@@ -65,6 +67,7 @@ pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
 pub use frame_files::{FrameClock, FrameFileFormat, read_frame_file};
+pub use home_assistant::{home_assistant_attributes, home_assistant_discovery};
 pub use messages::{
     BoxMapping, DetectedBox, JsonMapping, MessageContext, MessageDecoder, MessageFormat, MessageItem,
     NamedDetection, Reading, decoder,
@@ -72,7 +75,8 @@ pub use messages::{
 pub use outgoing::{OutgoingPosition, cot_event, onvif_frame, position_json};
 pub use recording::{read_recording, write_recording};
 pub use rows::{
-    ObservedRow, RowRules, read_detections, read_observation_features, read_observations, read_samples,
+    ObservedRow, RowRules, read_detections, read_live_items, read_observation_features, read_observations,
+    read_samples,
 };
 pub use source_decoder::source_decoder;
 pub use track_files::{TrackFile, TrackFileFormat};

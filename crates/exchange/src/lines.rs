@@ -3,10 +3,12 @@
 use std::io::{self, BufRead, BufReader, Read};
 
 use super::MAX_ROW_BYTES;
+use super::file_row::RowError;
+use crate::domain::{Error, Result};
 
 /// One line without its line ending.
 pub(super) enum Line<'a> {
-    /// Valid text.
+    /// The line is valid text.
     Text(&'a str),
     /// It is not UTF-8.
     NotUtf8,
@@ -22,6 +24,20 @@ pub(super) struct Lines<R> {
 }
 
 impl<R: Read> Lines<R> {
+    /// The next line and its number, without spaces about it, or why it is no text; `None` at the end of the file.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub(super) fn next_text(&mut self) -> Result<Option<(u64, Result<&str, RowError>)>> {
+        let Some((number, line)) = self.next_line().map_err(Error::fault)? else { return Ok(None) };
+        let text = match line {
+            Line::Text(text) => Ok(text.trim()),
+            Line::NotUtf8 => Err(RowError::whole(number, "is not UTF-8")),
+            Line::TooLong => Err(RowError::whole(number, "is longer than 64 KiB")),
+        };
+        Ok(Some((number, text)))
+    }
+
     pub(super) fn new(reader: R) -> Self {
         Self { reader: BufReader::with_capacity(64 * 1024, reader), line: Vec::with_capacity(256), number: 0 }
     }

@@ -13,7 +13,7 @@ use serde::de::{
 /// A vector that grows has twice the place of its elements; so have maps.
 const GROWTH: usize = 2;
 
-/// Parses a value whose structs are objects, and whose elements and map entries come to at most so many bytes in memory.
+/// Parses a value whose structs are objects, with a limit on the memory of its elements and map entries, bytes.
 ///
 /// # Errors
 /// Those of the deserializer, also for an array instead of an object, and for more elements.
@@ -27,9 +27,9 @@ pub(super) fn deserialize<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
 /// Any part of a deserializer, so that nested values are parsed by the same rule.
 struct ObjectsOnly<'b, T> {
     inner: T,
-    /// What may still be taken for elements, bytes.
+    /// Memory left for elements, bytes.
     left_bytes: &'b Cell<usize>,
-    /// Whether the keys of an object are entries of a map, and not fields of a struct.
+    /// True if the keys of an object are entries of a map, and not fields of a struct.
     is_map: bool,
 }
 

@@ -3,7 +3,7 @@
 use std::io::Read;
 
 use super::columns::{HEIGHT, LEFT, TARGET_ID, TIME, TOP, WIDTH};
-use super::csv_layout::LaidOut;
+use super::csv_layout::{CsvLayout, LaidOut};
 use super::csv_rows::CsvRows;
 use super::elements::Elements;
 use super::feature::FeatureCollection;
@@ -12,12 +12,12 @@ use super::format::Format;
 use super::lines::{Line, Lines};
 use super::wire::{self, box_within};
 use crate::domain::{
-    Detection, Error, ErrorKind, ImageSize, Observation, Result, Sample, Score, StoredSample, TargetClass,
-    TargetId, TimeBounds, convert_all, parse_time,
+    Detection, Error, ErrorKind, ImageSize, LiveItem, Observation, ReceiverId, Result, Sample, Score,
+    StoredSample, TargetClass, TargetId, TimeBounds, TrackerId, convert_all, parse_time,
 };
 use crate::geo::Position;
 
-/// What rows are checked against.
+/// The rules that rows are checked against.
 #[derive(Debug, Clone, Copy)]
 pub struct RowRules {
     /// Valid times.
@@ -26,7 +26,7 @@ pub struct RowRules {
     pub image_size: Option<ImageSize>,
 }
 
-/// A row of a file to fuse, evaluate or replay.
+/// A row of a file to fuse or evaluate.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ObservedRow {
     /// The observation.
@@ -81,6 +81,24 @@ pub fn read_observations<R: Read>(
     Ok(std::iter::from_fn(move || rows.next_row(|row| converter.observed(&row))))
 }
 
+/// Live items of a file: rows as those of [`read_observations`] that may also have `tracker_id`, the number by the camera's
+/// tracker of a box whose target is not known, and `receiver_id`, the receiver of a fix that names no target.
+///
+/// # Errors
+/// As [`read_samples`].
+pub fn read_live_items<R: Read>(
+    reader: R,
+    format: Format,
+    rules: &RowRules,
+) -> Result<impl Iterator<Item = Result<Result<LiveItem, RowError>>> + use<R>> {
+    let mut rows = match format {
+        Format::Csv => Rows::Csv(CsvRows::with_receivers(reader, &[TIME], &CsvLayout::default())?),
+        format => Rows::new(reader, &format.into(), &[TIME], rules)?,
+    };
+    let mut converter = RowConverter::new(*rules);
+    Ok(std::iter::from_fn(move || rows.next_row(|row| converter.live_item(&row))))
+}
+
 /// Observations of a GeoJSON feature collection (RFC 7946): the properties of a feature are those of a row,
 /// and its point is the fix, with the property `sigma_m`. Any fault refuses them all.
 ///
@@ -119,12 +137,14 @@ fn required(with_target: bool) -> Vec<usize> {
 struct RowConverter {
     rules: RowRules,
     target_id: Option<TargetId>,
+    tracker_id: Option<TrackerId>,
+    receiver_id: Option<ReceiverId>,
     class: Option<TargetClass>,
 }
 
 impl RowConverter {
     const fn new(rules: RowRules) -> Self {
-        Self { rules, target_id: None, class: None }
+        Self { rules, target_id: None, tracker_id: None, receiver_id: None, class: None }
     }
 
     fn sample(&mut self, row: &FileRow<'_>, default_target: Option<&TargetId>) -> Result<StoredSample> {
@@ -154,7 +174,30 @@ impl RowConverter {
         })
     }
 
+    /// The item of a row. The tracker's number of a sample whose target is known says nothing more.
+    fn live_item(&mut self, row: &FileRow<'_>) -> Result<LiveItem> {
+        let receiver_id =
+            shared(row.receiver_id.as_ref(), &mut self.receiver_id, ReceiverId::as_str, ReceiverId::new)?;
+        let tracker_id =
+            shared(row.tracker_id.as_ref(), &mut self.tracker_id, TrackerId::as_str, TrackerId::new)?;
+        let ObservedRow { observation, class, score, truth: _ } = self.row(row)?;
+        let tracker_id = tracker_id.filter(|_| observation.target_id().is_none());
+        let observation = observation.with_tracker_id(tracker_id.clone())?;
+        let (time, target_id, bounding_box, fix) = observation.into_parts();
+        Ok(LiveItem { time, target_id, tracker_id, receiver_id, bounding_box, fix, class, score })
+    }
+
     fn observed(&mut self, row: &FileRow<'_>) -> Result<ObservedRow> {
+        if row.receiver_id.is_some() {
+            return Err(Error::invalid(
+                "receiver_id",
+                "belongs to files of fixes; name the target in target_id",
+            ));
+        }
+        self.row(row)
+    }
+
+    fn row(&mut self, row: &FileRow<'_>) -> Result<ObservedRow> {
         let time = parse_time(row.time.as_ref().ok_or_else(|| missing("time"))?.as_str())?;
         let time = self.rules.time_bounds.check(time)?;
         let target_id = shared(row.target_id.as_ref(), &mut self.target_id, TargetId::as_str, TargetId::new)?;

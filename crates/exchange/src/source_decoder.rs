@@ -1,4 +1,4 @@
-//! What a source takes of its messages, and how it names receivers that they do not name.
+//! The items that a source uses of its messages, and the names of receivers that the messages do not name.
 
 use crate::connection::{ReceiverFrom, SourceSettings};
 use crate::domain::{ReceiverId, Score, TargetClass};

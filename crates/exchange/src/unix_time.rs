@@ -6,7 +6,7 @@ use jiff::Timestamp;
 /// unit up to a thousand times as much. Before 1973 a finer unit would be taken for a coarser one.
 ///
 /// # Errors
-/// What is not the number of a time.
+/// The error names the number if it is not a time.
 pub(super) fn unix_time(number: f64) -> Result<Timestamp, String> {
     let per_second = match number.abs() {
         size if size < 1e11 => 1.0,

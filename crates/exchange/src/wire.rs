@@ -436,7 +436,7 @@ impl fmt::Display for Flags<'_> {
     }
 }
 
-/// What the elements of a text may come to in memory, for each of its bytes, bytes.
+/// The largest memory of the elements of a text, for each byte of the text, bytes.
 const MEMORY_PER_BYTE: usize = 8;
 /// The same whatever its length: a batch of a thousand short observations.
 const FREE_MEMORY_BYTES: usize = 512 * 1024;

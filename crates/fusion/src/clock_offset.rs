@@ -3,7 +3,7 @@
 //! For any camera geometry, motion in the image and motion of the fixes agree best at the true offset.
 //! Displacements over a few seconds are regressed linearly on differences of box features; the estimate
 //! maximises the explained share of their variance (R^2) over the offset. Displacements instead of
-//! positions cancel the receiver's slow bias. Never here: files, pairing.
+//! positions cancel the receiver's slow bias. Does not read files or pair.
 
 use jiff::{SignedDuration, Timestamp};
 use nalgebra::{SMatrix, SVector};
@@ -49,7 +49,7 @@ pub struct OffsetEstimate {
     pub explained: f64,
     /// R^2 at offset 0.
     pub explained_at_zero: f64,
-    /// Displacements used.
+    /// Number of displacements used.
     pub rows: usize,
 }
 
@@ -137,7 +137,7 @@ fn feature_differences(boxes: &[(f64, SVector<f64, FEATURES>)], baseline_s: f64)
 
 /// How well the boxes explain the motion of the fixes.
 struct Explained {
-    /// R^2.
+    /// Share of the variance that is explained, R^2.
     share: f64,
     rows: usize,
     /// Time covered, without gaps.

@@ -30,7 +30,7 @@ pub struct FrameLimits {
     pub items_per_frame: usize,
 }
 
-/// What became of an item.
+/// The outcome of a push.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PushOutcome {
     /// Part of a frame that waits.
@@ -148,7 +148,7 @@ impl<S: Clone + Ord + Hash, T> FrameAssembler<S, T> {
         Some(AssembledFrame { source, time, items: frame.items })
     }
 
-    /// Whether no frame waits.
+    /// True if no frame waits.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.waiting.is_empty()

@@ -17,7 +17,7 @@
 //! handed in.
 
 #![warn(missing_docs)]
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 pub mod association;

@@ -14,7 +14,7 @@ use crate::statistics::CHI_SQUARE_99_9;
 /// 1,000 is.
 pub const PAIR_GATE: f64 = CHI_SQUARE_99_9;
 
-/// Error variance per axis taken for a receiver of which nothing is known, m2: a phone in the open.
+/// Error variance per axis of an unknown receiver, m2: a phone in the open.
 pub const UNKNOWN_RECEIVER_M2: f64 = 25.0;
 
 /// Least radius of a camera's scene, m: a target may be beyond what few samples of one place have shown.
@@ -43,7 +43,7 @@ pub struct ObservedFix {
     pub variance_m2: f64,
     /// In the model's plane; `None` without a model, or beyond the plane's range.
     pub in_plane: Option<EastNorth>,
-    /// Whether it may be of a target in view: within [`Regressor::scene_radius_m`] (at least
+    /// True if it may be of a target in view: within [`Regressor::scene_radius_m`] (at least
     /// [`LEAST_SCENE_RADIUS_M`]) and four of its standard deviations of the scene's centre.
     pub is_in_scene: bool,
     /// For how long the target's fixes have been the same to the last digit, s.
@@ -57,26 +57,26 @@ pub struct ObservedBox {
     pub one_step: Regression,
     /// From the box alone, so independent of the fix.
     pub independent: Regression,
-    /// Whether `independent` and its covariance are finite and within the plane's range. If not, both regressions are
+    /// True if `independent` and its covariance are finite and within the plane's range. If not, both regressions are
     /// replaced by the plane's origin with [`PLANE_RANGE_M`] as their 95 % radius.
     pub is_usable: bool,
-    /// Whether the box is unlike those of training or cut by the image's border.
+    /// True if the box is unlike those of training or cut by the image's border.
     pub is_unusual: bool,
-    /// Whether its error is as large as the scene: it says no more than that a target is in view.
+    /// True if its error is as large as the scene: it says no more than that a target is in view.
     pub is_vague: bool,
-    /// Whether something hides the lower part of the target, more probably than not.
+    /// True if something hides the lower part of the target, more probably than not.
     pub is_foot_hidden: bool,
     /// For how long the target's boxes have been the same to the pixel, s.
     pub repeated_s: f64,
-    /// Whether that is longer than a standing target shows: the picture or the detector stands still, and the target may
-    /// be anywhere in the scene.
+    /// True if that is longer than a standing target shows: the picture or the detector stands still, and the target
+    /// may be anywhere in the scene.
     pub is_frozen: bool,
 }
 
-/// What an observation measures.
+/// The positions that an observation measures.
 #[derive(Debug, Clone, Copy)]
 pub struct ObservedPositions<'a> {
-    /// When.
+    /// The instant of the measurement.
     pub time: Timestamp,
     /// The plane of the camera's model; `None` without a model.
     pub plane: Option<&'a LocalPlane>,
@@ -115,9 +115,9 @@ impl ObservedBox {
         regressor: &Regressor,
         fix: Option<EastNorth>,
         image_size: Option<ImageSize>,
-        recent: Option<&mut RecentBoxes>,
+        mut recent: Option<&mut RecentBoxes>,
     ) -> Self {
-        let hidden = regressor.hidden_foot(bounding_box);
+        let hidden = regressor.hidden_foot(bounding_box, recent.as_deref_mut());
         let is_foot_hidden = hidden.is_some_and(|hidden| hidden.probability >= 0.5);
         let seen = match recent.filter(|_| !is_foot_hidden) {
             Some(recent) => regressor.regress_next(bounding_box, None, recent),
@@ -196,7 +196,7 @@ impl<'a> ObservedPositions<'a> {
         }
     }
 
-    /// Whether neither the box nor the fix gives a position.
+    /// True if neither the box nor the fix gives a position.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.fix.is_none() && self.usable_box().is_none()
@@ -208,7 +208,7 @@ impl<'a> ObservedPositions<'a> {
         self.regressed.as_ref().filter(|observed| observed.is_usable)
     }
 
-    /// Whether the fix lies beyond the range of the model's plane.
+    /// True if the fix lies beyond the range of the model's plane.
     #[must_use]
     pub fn fix_is_out_of_range(&self) -> bool {
         self.plane.is_some() && self.fix.is_some_and(|fix| fix.in_plane.is_none())

@@ -103,8 +103,8 @@ pub struct TrackEstimate {
 }
 
 impl TargetTrack {
-    /// What the next observation of the target measures, its box seen beside the target's latest ones: a
-    /// deviation too small to be noticed in one box is noticed when it lasts.
+    /// Returns the positions that the next observation of the target measures. Its box is compared with the target's
+    /// latest ones: a deviation too small to be noticed in one box is noticed when it lasts.
     pub fn observe<'a>(
         &mut self,
         observation: &Observation,
@@ -138,9 +138,10 @@ impl TargetTrack {
         let plane = self.plane_for(observed, &mut rejected);
         let Some(plane) = plane else { return self.estimate_with(rejected) };
         let mut measurement = measurement_in(&plane, observed, rejected.is_empty());
-        withhold_useless(&mut measurement, observed, self.active.is_some(), &mut rejected);
+        // An active track decides about such positions itself, as it has to take back what it learnt from their source.
         if self.active.is_none() {
             withdraw_contradicting(&mut measurement, observed, &mut rejected);
+            withhold_useless(&mut measurement, observed, &mut rejected);
         }
         let mut state = match &mut self.active {
             Some(active) => active.track.update(&measurement),
@@ -266,22 +267,20 @@ fn measurement_in(plane: &LocalPlane, observed: &ObservedPositions<'_>, with_fix
             white: Some(box_noise),
             stated_scale: scale,
             repeated_s: observed.repeated_s,
-            is_doubtful: observed.is_unusual,
+            is_doubtful: observed.is_unusual || observed.is_vague,
+            is_vague: observed.is_vague,
         }
     });
     Measurement { time: observed.time, fix, regressed }
 }
 
-/// A box that says no more than that a target is in view enters no track, and a frozen one starts none.
+/// A box that says no more than that a target is in view, or that is frozen, starts no track.
 fn withhold_useless(
     measurement: &mut Measurement,
     observed: &ObservedPositions<'_>,
-    is_active: bool,
     rejected: &mut Vec<Rejection>,
 ) {
     let reason = match observed.usable_box() {
-        // An active track decides about it, as it has to take back what it learnt from such boxes.
-        Some(seen) if seen.is_frozen && is_active => return,
         Some(seen) if seen.is_frozen => RejectionReason::Frozen,
         Some(seen) if seen.is_vague => RejectionReason::UnusableVariance,
         _ => return,
@@ -307,6 +306,7 @@ fn withdraw_contradicting(
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
     use std::ops::ControlFlow;
 
     use jiff::SignedDuration;
@@ -314,7 +314,7 @@ mod tests {
     use super::*;
     use crate::domain::{Fix, GnssError, Recipe};
     use crate::model::{FitOptions, fit};
-    use crate::simulation::{Options, simulate};
+    use crate::simulation::{Options, World, simulate};
 
     fn fix_at(seconds: i64, longitude_deg: f64, latitude_deg: f64) -> Observation {
         let position = Position::new(longitude_deg, latitude_deg).expect("valid");
@@ -370,9 +370,7 @@ mod tests {
         assert_eq!(accepted, [false, false, true, true, true]);
     }
 
-    #[test]
-    fn the_error_of_the_map_s_scale_is_in_that_of_the_velocity() {
-        let world = simulate(&Options { samples: 400, ..Options::demo() });
+    fn trained(world: &World) -> Regressor {
         let options = FitOptions {
             recipe: Recipe::GaussianProcess,
             seed: 1,
@@ -382,7 +380,45 @@ mod tests {
             gnss_bias_sigma_m: None,
         };
         let fitted = fit(&world.training_samples(), &options, &mut |_| ControlFlow::Continue(()));
-        let model = fitted.expect("usable samples").load().expect("a model");
+        fitted.expect("usable samples").load().expect("a model")
+    }
+
+    #[test]
+    fn a_foot_that_stays_hidden_is_noticed_in_more_boxes_than_one_by_one() {
+        let world = simulate(&Options { samples: 800, targets: 4, ..Options::demo() });
+        let model = trained(&world);
+        let is_hidden = |observed: &ObservedPositions<'_>| {
+            usize::from(observed.regressed.is_some_and(|seen| seen.is_foot_hidden))
+        };
+        for hidden_share in [0.2, 0.0] {
+            let mut tracks: BTreeMap<usize, TargetTrack> = BTreeMap::new();
+            let (mut followed, mut alone) = (0, 0);
+            for row in &world.rows {
+                let Some(bounding_box) = row.bounding_box else { continue };
+                let [left_px, top_px, width_px, height_px] = bounding_box.sides_px();
+                let seen = BoundingBox::new(left_px, top_px, width_px, (1.0 - hidden_share) * height_px);
+                let observation = Observation::new(row.time, None, seen.ok(), row.fix).expect("a box");
+                let track = tracks.entry(row.target).or_default();
+                let model = Some(&model);
+                followed += is_hidden(&track.observe(&observation, model, Some(world.image_size), None));
+                alone += is_hidden(&ObservedPositions::of(
+                    &observation,
+                    model,
+                    Some(world.image_size),
+                    None,
+                    None,
+                ));
+            }
+            let most_whole = alone + world.rows.len() / 8;
+            let is_noticed = if hidden_share > 0.0 { followed > alone } else { followed <= most_whole };
+            assert!(is_noticed, "{hidden_share}: {followed}, one by one {alone}");
+        }
+    }
+
+    #[test]
+    fn the_error_of_the_map_s_scale_is_in_that_of_the_velocity() {
+        let world = simulate(&Options { samples: 400, ..Options::demo() });
+        let model = trained(&world);
         let mut track = TargetTrack::default();
         let mut strained = 0;
         for observation in world.rows.iter().filter(|row| row.target == 0).filter_map(|row| row.observation())

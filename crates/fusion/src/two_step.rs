@@ -242,7 +242,7 @@ mod tests {
             let apart = regression.regressed.distance_m(fix);
             prop_assert!(fused.distance_m(fix) + fused.distance_m(regression.regressed) <= apart + 1e-9);
             prop_assert!(r95_m <= R95_PER_SIGMA * e_regression_m2.min(e_gnss_m2).sqrt() + 1e-9);
-            // Of isotropic errors the covariance has the stated radius as it is.
+            // For isotropic errors the covariance has the stated radius as it is.
             let covariance = fused_covariance(&regression, e_gnss_m2, confidences(e_regression_m2, e_gnss_m2));
             prop_assert!((covariance.r95_m() / r95_m - 1.0).abs() < 2e-3);
             prop_assert!((covariance.with_r95_m(2.0 * r95_m).r95_m() / r95_m - 2.0).abs() < 1e-9);

@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::domain::{EpochReport, Error, HeldOutSampleError, RunProgress};
 use crate::network::{LossSums, LossWeights, NetShape, Schedule, TrainError, TrainingSet, train};
 
-/// What the observer of a fit receives.
+/// An event that the observer of a fit receives.
 #[derive(Debug)]
 pub enum FitEvent<'a> {
     /// The progress of the run; `remaining_s` is left to the observer, which has a clock.
@@ -88,7 +88,7 @@ pub(crate) struct Phase<'r, 'a> {
     pub(crate) run: &'r mut FitRun<'a>,
     pub(crate) name: String,
     pub(crate) rng: ChaCha8Rng,
-    /// Whether the epochs of this phase are those of the run's curve.
+    /// True if the epochs of this phase are those of the run's curve.
     pub(crate) is_final: bool,
     /// Loss weights that replace the recipe's own.
     pub(crate) loss_weights: Option<LossWeights>,

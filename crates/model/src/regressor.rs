@@ -17,9 +17,9 @@ use crate::statistics::R95_PER_SIGMA;
 pub struct JointError {
     /// The run that trained them.
     pub run: RunId,
-    /// What their maps have in common: no averaging over them removes it.
+    /// The part that their maps have in common: no averaging over them removes it.
     pub common_m2: PlaneCovariance,
-    /// What of the box's noise lasts while the target moves some metres.
+    /// The part of the box's noise that lasts while the target moves some metres.
     pub lasting_noise_m2: PlaneCovariance,
 }
 
@@ -54,10 +54,10 @@ pub struct Regression {
     /// Covariance of the error, m2; its mean variance is `e_regression_m2`. Isotropic but for the recipe
     /// `gaussian_process`.
     pub covariance: PlaneCovariance,
-    /// Of `covariance`, the part that is independent from box to box (the detector's noise); the rest is the
+    /// The part of `covariance` that is independent from box to box (the detector's noise); the rest is the
     /// same whenever the target returns to a place.
     pub box_noise: PlaneCovariance,
-    /// Whether the box is unlike those of the training samples.
+    /// True if the box is unlike those of the training samples.
     pub outside_training: bool,
     /// `r95_m = r95_scale * sqrt(e)` of the regressed and of the fused position.
     pub r95_scale: f64,
@@ -127,7 +127,7 @@ pub struct Regressor {
     track_noise: Option<TrackNoiseModel>,
     /// Added to every error variance, m2 per axis.
     added_m2: f64,
-    /// Models of earlier formats have none.
+    /// `None` while the model is fitted.
     pub(super) scene: Option<Scene>,
     frozen_after_s: f64,
     pub(super) error_model: ErrorModel,
@@ -196,13 +196,13 @@ impl Regressor {
     }
 
     /// Radius about the plane's origin, the centre of the training positions, that holds these: three of their
-    /// standard deviations per axis, m. Infinite for a model of an earlier format.
+    /// standard deviations per axis, m. Infinite while the model is fitted.
     #[must_use]
     pub fn scene_radius_m(&self) -> f64 {
         self.track_noise.map_or(f64::INFINITY, |noise| noise.regression_length_m)
     }
 
-    /// Whether an answer says no more than that a target is in view: its error is as large as the ground that training
+    /// True if an answer says no more than that a target is in view: its error is as large as the ground that training
     /// covers, and larger than twice a fix's.
     #[must_use]
     pub fn is_vague(&self, regression: &Regression) -> bool {
@@ -241,7 +241,7 @@ impl Regressor {
         self.white_share
     }
 
-    /// Whether the regressed position depends on the fix: a network of `paper` has it among its inputs.
+    /// True if the regressed position depends on the fix: a network of `paper` has it among its inputs.
     #[must_use]
     pub const fn uses_fix(&self) -> bool {
         matches!(self.encoder, Encoder::Paper(_))
@@ -302,13 +302,20 @@ impl Regressor {
         }
     }
 
-    /// Whether something hides the lower part of a box, as far as the model knows how tall its targets are: only one of
-    /// the recipe `gaussian_process` does.
+    /// Returns the completed boxes if something hides the lower part of a box. Only a model of the recipe
+    /// `gaussian_process` knows how tall its targets are; others return `None`.
+    /// `recent` summarises the earlier boxes of the same target and takes this one in.
     #[must_use]
     #[inline]
-    pub fn hidden_foot(&self, bounding_box: &BoundingBox) -> Option<HiddenFoot> {
+    pub fn hidden_foot(
+        &self,
+        bounding_box: &BoundingBox,
+        recent: Option<&mut RecentBoxes>,
+    ) -> Option<HiddenFoot> {
         match &self.encoder {
-            Encoder::GaussianProcess(map) => HiddenFoot::of(bounding_box, &map.predictor.plausibility),
+            Encoder::GaussianProcess(map) => {
+                HiddenFoot::of(bounding_box, &map.predictor.plausibility, recent)
+            }
             Encoder::Paper(_) | Encoder::Hybrid(_) | Encoder::Projective(_) => None,
         }
     }

@@ -7,7 +7,7 @@ use crate::domain::{BoundingBox, Result};
 use crate::geo::{EastNorth, Position};
 use crate::statistics::median;
 
-/// What a model covers, and how well.
+/// The area that a model covers, with its error.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ViewArea {
     /// Convex hull of the positions of the training boxes' coverage centres, counterclockwise; fewer than

@@ -1,6 +1,6 @@
 //! A calibrated pinhole camera with radial distortion. No estimation method uses it.
 //!
-//! Never here: noise.
+//! Does not add noise.
 
 use crate::domain::ImageSize;
 use crate::geo::EastNorth;

@@ -97,7 +97,7 @@ impl Episodes {
         Self { begin_probability, end_probability, is_on: false, random }
     }
 
-    /// Whether the next row is in an episode, and a uniform number in 0..1 for the use of that row.
+    /// Returns true if the next row is in an episode, and a uniform number in 0..1 for the use of that row.
     pub(super) fn next_row(&mut self) -> (bool, f64) {
         let draw = self.random.random::<f64>();
         self.is_on = if self.is_on { draw >= self.end_probability } else { draw < self.begin_probability };

@@ -56,9 +56,9 @@ pub struct Options {
     /// Radial displacement at the image's corner divided by its distance from the centre; negative for
     /// barrel distortion.
     pub lens_distortion: f64,
-    /// Whether rows whose box is truncated by the image border are kept.
+    /// True if rows whose box is truncated by the image border are kept.
     pub border_cuts: bool,
-    /// Whether rows with such a box are left out, although the camera truncates boxes.
+    /// True if rows with such a box are left out, although the camera truncates boxes.
     pub without_cut_boxes: bool,
     /// Share of rows in which the lower part of the target, or all of it, is occluded.
     pub occlusion: f64,

@@ -32,7 +32,7 @@ pub(super) struct MotionProfile {
     pub(super) lateral_deviation_m: f64,
     /// Longest halt in a traverse, s; 0 for none.
     pub(super) halt_s: f64,
-    /// Whether every second traverse is in the opposite direction.
+    /// True if every second traverse is in the opposite direction.
     pub(super) both_ways: bool,
 }
 

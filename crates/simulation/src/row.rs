@@ -5,7 +5,7 @@ use jiff::Timestamp;
 use crate::domain::{BoundingBox, Fix, Observation, TargetClass, TargetId};
 use crate::geo::Position;
 
-/// What camera and receiver measured of one target at one second, with the truth.
+/// The measurements of one target by camera and receiver at one second, with the truth.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SimulatedRow {
     /// The instant.
@@ -25,7 +25,7 @@ pub struct SimulatedRow {
 }
 
 impl SimulatedRow {
-    /// What camera and receiver give; `None` if neither gives anything.
+    /// The observation by camera and receiver; `None` if neither gives anything.
     #[must_use]
     pub fn observation(&self) -> Option<Observation> {
         Observation::new(self.time, Some(self.target_id.clone()), self.bounding_box, self.fix).ok()

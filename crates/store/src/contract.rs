@@ -64,7 +64,7 @@ contract! {
     /// Faults only.
     fn camera_versions(&self, since: Option<ChangeMark>) -> Result<CameraVersions>;
 
-    /// What is needed to answer for each of some cameras, in their order.
+    /// The contents needed to answer for each of some cameras, in their order.
     ///
     /// # Errors
     /// Faults only; for one camera [`ErrorKind::CameraNotFound`], or a fault of its rows.
@@ -168,13 +168,13 @@ contract! {
     /// [`ErrorKind::CameraNotFound`].
     fn thinned_detections(&self, id: &CameraId, filter: &SampleFilter, most: u32) -> Result<Vec<Detection>>;
 
-    /// How many samples a filter selects.
+    /// Number of samples that a filter selects.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`].
     fn count_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64>;
 
-    /// How many of the samples with a fix that a filter selects state the truth.
+    /// Number of samples with a fix that a filter selects and that state the truth.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`].
@@ -186,7 +186,7 @@ contract! {
     /// [`ErrorKind::CameraNotFound`].
     fn sample_time(&self, id: &CameraId, before: u64) -> Result<Option<Timestamp>>;
 
-    /// How many samples with a fix a filter selects, and the corners of the ground they cover (south-west,
+    /// Number of samples with a fix that a filter selects, and the corners of the ground they cover (south-west,
     /// north-east in degrees; across the antimeridian, of the whole parallel).
     ///
     /// # Errors
@@ -413,7 +413,7 @@ contract! {
     /// [`ErrorKind::EvaluationNotFound`].
     fn delete_evaluation(&self, id: EvaluationId, now: Timestamp) -> Result<()>;
 
-    /// How many jobs have not ended.
+    /// Number of jobs that have not ended.
     ///
     /// # Errors
     /// Faults only.
@@ -450,7 +450,7 @@ contract! {
     /// Faults only.
     fn key_by_digest(&self, digest: &SecretDigest) -> Result<Option<ApiKey>>;
 
-    /// Whether the keys have changed since a version was read.
+    /// The version of the keys, which changes when a key does.
     ///
     /// # Errors
     /// Faults only.
@@ -493,8 +493,8 @@ contract! {
     /// Faults only.
     fn maintain(&self) -> Result<StorageStatus>;
 
-    /// What time it is for everything that is stored: by the clock of a database's server, which all processes share; a data
-    /// folder has that of its process, which is handed in.
+    /// The time for everything that is stored: of the clock of a database's server, which all processes share; for a
+    /// data folder, of the clock of its process, which is handed in.
     ///
     /// # Errors
     /// Faults only.
@@ -616,7 +616,7 @@ contract! {
     /// Faults only.
     fn delete_dead_letters(&self, connection: &Connection, now: Timestamp) -> Result<u64>;
 
-    /// What is in the outbox of a connection.
+    /// The numbers of messages in the outbox of a connection.
     ///
     /// # Errors
     /// Faults only.

@@ -67,7 +67,7 @@ impl Table {
 /// A table that was copied.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CopiedTable {
-    /// Its name.
+    /// The name of the table.
     pub name: &'static str,
     /// Its rows, in either store.
     pub rows: u64,
@@ -75,7 +75,7 @@ pub struct CopiedTable {
     pub sha256: String,
 }
 
-/// What a column holds.
+/// The type of a column's values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     Integer,

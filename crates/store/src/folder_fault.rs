@@ -2,7 +2,7 @@
 
 use crate::domain::Error;
 
-/// What is wrong with a data folder, or with the database in its place.
+/// The kinds of faults of a data folder, or of the database used instead of one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FolderFaultKind {
     /// Another process holds it; it may be tried again later.
@@ -27,7 +27,7 @@ pub enum FolderFaultKind {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{message}")]
 pub struct FolderFault {
-    /// What is wrong.
+    /// The kind of fault.
     pub kind: FolderFaultKind,
     message: String,
 }

@@ -2,8 +2,8 @@
 //!
 //! A commit costs much more than a row, so every batch that is queued when a transaction begins joins
 //! it. Nothing is acknowledged before its commit, and a caller's batch is stored atomically.
-//! Never here: a caller waits for more callers to come, the queue grows without bound, a
-//! cancelled caller disturbs the others.
+//! A caller does not wait for more callers to come, the queue has a limit, and a cancelled caller does not disturb the
+//! others.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -19,7 +19,7 @@ use super::rows::idempotency::IdempotencyRecord;
 use super::rows::samples::{Row, SampleTable, keep_last};
 use crate::domain::{Actor, CameraId, CameraKey, Durability, Error, OnConflict, Result, StoredSample};
 
-/// A transaction takes no further caller beyond so many rows.
+/// A transaction takes no further caller beyond this number of rows.
 const ROWS_PER_TRANSACTION: usize = 4_096;
 
 /// Rows that wait or are being committed; further callers wait to queue theirs.
@@ -28,16 +28,16 @@ const ROWS_IN_FLIGHT: u32 = 65_536;
 /// Callers that wait; each has at least one row, so more never wait.
 const QUEUE: usize = 16_384;
 
-/// What became of the samples of one call.
+/// The outcome of the samples of one call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Inserted {
-    /// Stored now.
+    /// Samples stored now.
     pub accepted: u64,
     /// Stored before, under the same camera, target and time.
     pub duplicate: u64,
-    /// Of the accepted ones, those without a fix.
+    /// Number of accepted samples without a fix.
     pub without_fix: u64,
-    /// Of the accepted ones, those that replaced a stored sample on request.
+    /// Number of accepted samples that replaced a stored sample on request.
     pub replaced: u64,
 }
 
@@ -61,7 +61,7 @@ impl fmt::Debug for Completion {
 pub struct InsertOptions {
     /// When it is acknowledged.
     pub durability: Durability,
-    /// What becomes of samples that are stored already.
+    /// The rule for samples that are stored already.
     pub on_conflict: OnConflict,
     /// For the last batch of an import that its client may repeat.
     pub completion: Option<Completion>,
@@ -70,7 +70,7 @@ pub struct InsertOptions {
 }
 
 impl From<Durability> for InsertOptions {
-    /// A batch of which nothing is recorded.
+    /// A batch without an operation to be recorded.
     fn from(durability: Durability) -> Self {
         Self { durability, on_conflict: OnConflict::Keep, completion: None, now: Timestamp::UNIX_EPOCH }
     }
@@ -168,7 +168,7 @@ pub(super) trait WriteSession: Send {
 /// The outcomes of a group.
 pub(super) type Committing<'a> = BoxFuture<'a, Result<Vec<Result<Inserted>>, Failure>>;
 
-/// What stores the groups of a backend.
+/// Stores the groups of a backend.
 pub(super) trait SampleWriter: Send + Sync {
     /// Waits for the right to write.
     fn session(&self) -> BoxFuture<'_, Result<Box<dyn WriteSession + '_>>>;
@@ -220,7 +220,7 @@ impl SampleBatch {
     }
 }
 
-/// What is in the queue now, up to the rows of one transaction.
+/// Takes what is in the queue now, up to the rows of one transaction.
 fn gather(
     first: WriteRequest,
     requests: &mut mpsc::Receiver<WriteRequest>,
@@ -367,7 +367,7 @@ pub(super) struct Known {
     pub(super) samples: u64,
     /// Samples without a fix that are stored.
     pub(super) without_fix: u64,
-    /// Of these, those whose place samples of the group have taken.
+    /// Number of these whose place samples of the group have taken.
     pub(super) replaced: u64,
 }
 
@@ -375,7 +375,7 @@ pub(super) fn as_count(stored: i64) -> u64 {
     u64::try_from(stored).unwrap_or_default()
 }
 
-/// What a group has added to each camera, by its key: samples with a fix, samples without, and boxes whose place
+/// The changes of a group per camera, by its key: samples with a fix, samples without, and boxes whose place
 /// samples with a fix have taken.
 pub(super) fn changed_counts(
     cameras: &HashMap<String, Known>,
@@ -409,7 +409,7 @@ pub(super) fn outcomes_before(
     admitted.iter().zip(group).map(begin).collect()
 }
 
-/// Whether a group must be rolled back although its statements worked: what was to be replaced stays where the
+/// True if a group must be rolled back although its statements worked: what was to be replaced stays where the
 /// batch was refused.
 pub(super) fn must_roll_back(group: &[SampleBatch], outcomes: &[Result<Inserted>]) -> bool {
     group.iter().zip(outcomes).any(|(batch, outcome)| batch.replaces() && outcome.is_err())

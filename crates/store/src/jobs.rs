@@ -26,7 +26,7 @@ pub struct Claim<J> {
     pub cancel_requested: bool,
 }
 
-/// What a worker learns from its heartbeat.
+/// The answer to a worker's heartbeat.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Heartbeat {
     /// The lease is renewed.
@@ -60,14 +60,14 @@ pub struct JobCounts {
 pub enum JobEnd<O> {
     /// It produced its output.
     Succeeded {
-        /// What is stored with it.
+        /// The output that is stored with it.
         output: O,
         /// A sentence for the operator.
         outcome: Option<String>,
     },
     /// An error ended it.
     Failed {
-        /// The error.
+        /// The text of the error.
         outcome: String,
     },
     /// The operator cancelled it.
@@ -76,7 +76,7 @@ pub enum JobEnd<O> {
     Requeue,
 }
 
-/// What becomes of a job that its worker has finished.
+/// The new state of a job that its worker has finished.
 pub(super) struct Settled<O> {
     /// Its state from now on; `None` if it returns to the queue.
     pub(super) state: Option<JobState>,
@@ -153,7 +153,7 @@ pub struct JobTable {
     pub(super) table: &'static str,
     /// Column of what a job belongs to.
     pub(super) owner: &'static str,
-    /// What messages call the table's jobs.
+    /// The name of the table's jobs in messages.
     pub(super) plural: &'static str,
     /// Assignments that reset the table's own columns of progress.
     pub(super) reset_progress: &'static str,

@@ -1,4 +1,4 @@
-//! Persistent storage behind one type, [`Store`]; the only crate with SQL.
+//! Persistent storage as one type, [`Store`]; the only crate with SQL.
 //!
 //! Two backends: a file in a data folder (`sqlite`) and a database of a server (`postgres`). The methods of [`Store`]
 //! are listed once, in `contract`, with what they promise; the suite in `tests` holds both backends to it. What is
@@ -14,7 +14,7 @@
 //! against a server.
 
 #![warn(missing_docs)]
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod contract;
@@ -79,15 +79,15 @@ pub struct Store(Database);
 /// How a store is opened.
 #[derive(Debug, Clone)]
 pub struct StoreOptions {
-    /// What it may hold.
+    /// The limits of its contents.
     pub limits: StoreLimits,
-    /// What this process does, for the logs of others that use the same folder.
+    /// The purpose of this process, for the logs of others that use the same folder.
     pub role: String,
-    /// Whether other processes may use the folder in the same way.
+    /// States if other processes may use the folder in the same way.
     pub sharing: Sharing,
 }
 
-/// Whether several processes may use a folder in the same way.
+/// States if several processes may use a folder in the same way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sharing {
     /// A server: there is at most one, beside any number of commands.
@@ -163,7 +163,7 @@ impl Store {
         on_backend!(self, store => store.close().await);
     }
 
-    /// Whether the store answers.
+    /// Checks that the store answers.
     ///
     /// # Errors
     /// A fault if it does not.
@@ -198,8 +198,8 @@ impl Store {
         }
     }
 
-    /// Whether a damaged page was met since the process was started, so that a backup should be restored. Of a
-    /// PostgreSQL database its own log tells.
+    /// True if a damaged page was read since the process was started, so that a backup should be restored. For a
+    /// PostgreSQL database see its own log.
     #[must_use]
     pub fn is_damaged(&self) -> bool {
         match &self.0.backend {
@@ -208,7 +208,7 @@ impl Store {
         }
     }
 
-    /// Whether imports are refused for want of space, as far as is known without looking.
+    /// True if imports are refused for want of space, as far as is known without looking.
     #[must_use]
     pub fn is_full(&self) -> bool {
         on_backend!(self, store => store.is_full())

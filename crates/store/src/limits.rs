@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use crate::domain::{CameraId, Error, ErrorKind, Result, SampleOverflow};
 
-/// What an operator allows the store to hold. The default allows everything and reserves nothing.
+/// The limits that an operator sets for the store. The default allows everything and reserves nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StoreLimits {
     /// Cameras; more are refused.
@@ -19,7 +19,7 @@ pub struct StoreLimits {
     pub dead_letters: u32,
     /// Samples of one camera.
     pub samples_per_camera: u64,
-    /// What happens beyond that.
+    /// The rule for samples beyond that.
     pub sample_overflow: SampleOverflow,
     /// Samples of all cameras; more are refused.
     pub samples: u64,
@@ -72,7 +72,7 @@ impl Default for StoreLimits {
 pub struct StorageStatus {
     /// Size of the database, without its write-ahead log.
     pub database_bytes: u64,
-    /// Of these, free for new rows.
+    /// Bytes of these that are free for new rows.
     pub free_bytes: u64,
     /// Left on the disk; `None` where the system does not tell.
     pub disk_available_bytes: Option<u64>,
@@ -92,7 +92,7 @@ pub(super) struct SampleQuota<'s> {
 }
 
 impl SampleQuota<'_> {
-    /// Admits a batch of a camera that has so many samples, and counts it. Rows that will turn out to
+    /// Admits a batch of a camera that has `of_camera` samples, and counts it. Rows that will turn out to
     /// be duplicates count, too.
     pub(super) fn admit(&mut self, id: &CameraId, of_camera: &mut u64, rows: u64) -> Result<()> {
         let StoreLimits { samples_per_camera, sample_overflow, samples, .. } = *self.limits;
@@ -134,7 +134,7 @@ impl Usage {
         Self { limits, samples: AtomicU64::new(0), is_full: AtomicBool::new(false) }
     }
 
-    /// What one transaction may add.
+    /// The limits of one transaction, with the number of samples stored.
     pub(super) fn quota(&self) -> SampleQuota<'_> {
         SampleQuota { limits: &self.limits, samples: self.samples() }
     }
@@ -149,7 +149,7 @@ impl Usage {
         self.samples.store(u64::try_from(samples).unwrap_or_default(), Ordering::Relaxed);
     }
 
-    /// Whether the latest import was refused for want of space, and none has become free since.
+    /// True if the latest import was refused for want of space, and none has become free since.
     pub(super) fn is_full(&self) -> bool {
         self.is_full.load(Ordering::Relaxed)
     }

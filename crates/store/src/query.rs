@@ -20,7 +20,7 @@ pub enum AnyConnection<'c> {
     Postgres(&'c mut PgConnection),
 }
 
-/// What a statement is executed on: a transaction or a connection.
+/// A transaction or a connection on which statements are executed.
 pub trait Session: Send {
     fn connection(&mut self) -> AnyConnection<'_>;
 

@@ -37,7 +37,7 @@ impl StoredRow {
         }
     }
 
-    /// Whether a column is NULL; one that does not exist is.
+    /// True if a column is NULL or does not exist.
     pub(super) fn is_null(&self, index: usize) -> bool {
         match self {
             Self::Sqlite(row) => row.try_get_raw(index).map_or(true, |value| value.is_null()),
@@ -59,7 +59,7 @@ impl StoredRow {
     }
 }
 
-/// What both backends can decode.
+/// A type that both backends can decode.
 pub(super) trait Stored<'r>:
     Decode<'r, Sqlite> + Type<Sqlite> + Decode<'r, Postgres> + Type<Postgres>
 {

@@ -13,7 +13,7 @@ use crate::domain::{Actor, CameraId, Error, ErrorKind, Result, Scope};
 pub struct CertificateHolder {
     /// The first 16 hexadecimal digits of the certificate's SHA-256.
     pub fingerprint: Arc<str>,
-    /// What certificates of that authority may do.
+    /// The scope of certificates of that authority.
     pub scope: Arc<Scope>,
 }
 
@@ -35,7 +35,7 @@ pub enum Principal {
 }
 
 impl Principal {
-    /// What the principal is restricted to; `None` for no restriction, and for the anonymous, who may do
+    /// Returns the principal's scope; `None` for no restriction, and for the anonymous, who may do
     /// nothing.
     #[must_use]
     pub fn scope(&self) -> Option<&Scope> {
@@ -148,7 +148,7 @@ impl Caller {
         }
     }
 
-    /// Whether the caller may lose its access while a request is open.
+    /// True if the caller may lose its access while a request is open.
     #[must_use]
     pub fn is_revocable(&self) -> bool {
         matches!(self.principal(), Principal::Key(_) | Principal::User(_))

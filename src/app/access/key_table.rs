@@ -48,7 +48,6 @@ impl ActiveKey {
         &self.key
     }
 
-    /// Its name.
     #[must_use]
     pub fn name(&self) -> Arc<str> {
         self.name.clone()
@@ -118,7 +117,7 @@ pub(super) struct KeyTable {
 }
 
 impl KeyTable {
-    /// Whether no key was ever created; `false` before the store was read.
+    /// True if no key was ever created; `false` before the store was read.
     pub(super) fn is_empty(&self) -> bool {
         self.keys.load().version.as_ref().is_some_and(KeysVersion::is_empty)
     }
@@ -164,13 +163,13 @@ impl KeyTable {
         key.cloned().ok_or_else(does_not_work)
     }
 
-    /// Whether a key of that digest is in the table.
+    /// True if a key of that digest is in the table.
     pub(super) fn has(&self, digest: &SecretDigest) -> bool {
         let keys = self.keys.load();
         keys.by_bucket.get(&digest.bucket()).is_some_and(|keys| keys.iter().any(|key| key.digest == *digest))
     }
 
-    /// Whether so long has gone by since the latest call that it was worth a look at the store.
+    /// True if enough time has passed since the latest call to read the store again.
     pub(super) fn may_look(&self, at: Duration) -> bool {
         let (at_ns, pause_ns) = (as_ns(at), as_ns(LOOK_PAUSE));
         let looks =
@@ -194,7 +193,7 @@ impl KeyTable {
         let distrusted = self.distrusted.load(Ordering::Acquire);
         let known = self.keys.load_full();
         let version = store.keys_version().await?;
-        // What was open for a key that has expired has ended; if the clock was wrong, the key works again.
+        // Requests and streams of an expired key have ended; if the clock was wrong, the key works again.
         let has_returned = known.iter().any(|key| key.has_ended() && key.key.is_valid_at(now));
         if has_returned || known.version.as_ref() != Some(&version) {
             let is_first = known.version.as_ref().is_some_and(KeysVersion::is_empty) && !version.is_empty();
@@ -219,7 +218,7 @@ impl KeyTable {
         let mut kept = HashSet::new();
         for (key, digest) in stored {
             kept.insert(key.id);
-            // What is open for a key holds the same value, and ends with it.
+            // Requests and streams of a key hold the same value, and end with it.
             let known = by_id.get(&key.id).filter(|known| !known.has_ended());
             let active = known.map_or_else(|| ActiveKey::new(key, digest), |&it| it.clone());
             by_bucket.entry(digest.bucket()).or_default().push(active);

@@ -2,7 +2,7 @@
 //!
 //! [`Access::authenticate`] makes a [`Principal`] of a credential, [`Caller::authorize`] compares it with the
 //! [`Permission`] that an operation needs, and [`Caller::authorize_camera`] restricts devices to their
-//! cameras. All of it is answered from memory. Never here: headers, status codes, TLS.
+//! cameras. All of it is answered from memory. Does not know headers, status codes or TLS.
 
 mod caller;
 mod key_table;
@@ -29,14 +29,14 @@ use crate::store::{KeysVersion, Store};
 
 pub use caller::{Caller, CertificateHolder, Principal};
 pub use key_table::ActiveKey;
-pub use permission::{OPERATIONS, Operation, Permission, RoutePermission};
+pub use permission::Permission;
 pub use sessions::{SESSION_TIME, SessionToken};
 pub use signed_in_user::SignedInUser;
 
-/// What a client presents.
+/// The credential that a client presents.
 #[derive(Debug, Clone)]
 pub enum Credential<'a> {
-    /// Nothing.
+    /// No credential.
     None,
     /// A key's secret.
     Key(Cow<'a, str>),
@@ -79,7 +79,7 @@ impl Access {
         self.openid.get()
     }
 
-    /// Whether everybody may do everything, because no key was ever created.
+    /// True if everybody may do everything, because no key was ever created.
     #[must_use]
     pub fn is_open(&self) -> bool {
         !self.is_closed.load(Ordering::Relaxed) && self.keys.is_empty()
@@ -165,7 +165,7 @@ impl Access {
         self.sessions.start_for_user(token, identity, now, limits)
     }
 
-    /// Whether the audit log records a sign-in; it is counted then.
+    /// True if the audit log records a sign-in; it is counted then.
     pub(super) fn records_sign_in(&self, actor: &Actor, now: Timestamp) -> bool {
         self.sign_ins.takes(actor, now)
     }
@@ -186,11 +186,11 @@ impl Access {
         self.keys.refresh(store, now, began_at).await
     }
 
-    /// Whether the keys should be read again for a credential, at a reading of the monotonic clock: it is an unknown key, which
-    /// another process may have created a moment ago. So ten times a second at most, whatever clients present.
-    pub fn is_worth_refresh(&self, credential: Credential<'_>, monotonic: Duration) -> bool {
+    /// True if the keys should be read again for a credential, at a reading of the monotonic clock: it is an unknown
+    /// key, which another process may have created a moment ago. The keys are read at most ten times a second.
+    pub fn is_worth_refresh(&self, credential: &Credential<'_>, monotonic: Duration) -> bool {
         let Credential::Key(secret) = credential else { return false };
-        let Ok(secret) = KeySecret::parse(&secret) else { return false };
+        let Ok(secret) = KeySecret::parse(secret) else { return false };
         !self.is_open() && !self.keys.has(&secret.digest()) && self.keys.may_look(monotonic)
     }
 

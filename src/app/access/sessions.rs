@@ -65,7 +65,7 @@ impl Session {
     }
 }
 
-/// What is open for a user ends with the session; a key's end with the key.
+/// A user's open requests end with the session; a key's end with the key.
 impl Drop for Session {
     fn drop(&mut self) {
         if let Holder::User(user) = &self.holder {

@@ -16,7 +16,7 @@ const HOUR: SignedDuration = SignedDuration::from_hours(1);
 pub(super) struct SignInLog(Mutex<HashMap<String, (Timestamp, u32)>>);
 
 impl SignInLog {
-    /// Whether a sign-in is recorded; it is counted then.
+    /// True if a sign-in is recorded; it is counted then.
     pub(super) fn takes(&self, actor: &Actor, now: Timestamp) -> bool {
         let mut counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         counts.retain(|_, (since, _)| now.duration_since(*since).abs() < HOUR);

@@ -38,7 +38,7 @@ impl SignedInUser {
         self.subject.clone()
     }
 
-    /// What they may do.
+    /// Returns the scope of the user.
     #[must_use]
     pub const fn scope(&self) -> &Scope {
         &self.scope

@@ -100,7 +100,7 @@ pub(super) fn camera_text(camera: &CameraId) -> String {
     format!("camera {camera}")
 }
 
-/// What a client hears whose camera or site is owned by no node that can be named; it tries again.
+/// The refusal for a camera or site whose owner cannot be named; the client tries again.
 pub(super) fn between_nodes(owned: &str) -> Error {
     Error::refused(
         ErrorKind::CameraBetweenNodes,

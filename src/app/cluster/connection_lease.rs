@@ -33,7 +33,7 @@ impl ConnectionLease {
         self.0.as_ref().map_or(0, |held| held.fence)
     }
 
-    /// Whether nobody else can have the connection at this reading of the monotonic clock.
+    /// True if nobody else can have the connection at this reading of the monotonic clock.
     #[must_use]
     pub fn is_valid(&self, now: Duration) -> bool {
         self.0.as_ref().is_none_or(|held| held.is_valid(now))

@@ -86,7 +86,7 @@ impl App {
         self.cluster.membership().map(|membership| membership.registration.load().id)
     }
 
-    /// What the nodes know of a connection; `None` for a server that shares its database with no other.
+    /// The nodes' reports of a connection; `None` for a server that shares its database with no other.
     ///
     /// # Errors
     /// The database does not answer.
@@ -178,7 +178,7 @@ impl Membership {
         Ok(())
     }
 
-    /// Whether anything is left that was not released.
+    /// True if a connection is left that was not released.
     pub(super) fn holds_connections(&self) -> bool {
         !lock(&self.connections).is_empty()
     }

@@ -1,5 +1,5 @@
-//! What a node does by itself: renew, end the registrations of silent nodes, give up what nobody uses, hand over at its
-//! end.
+//! The periodic work of a node: it renews its registration, ends the registrations of silent nodes, releases unused
+//! leases, and hands over at its end.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -89,7 +89,7 @@ async fn renew(app: &App, membership: &Membership) -> Result<()> {
     let silent = membership.observe(nodes, registration.id, app.clock.monotonic());
     for (id, renewal) in silent {
         if membership.leases.end_unrenewed(id, renewal).await? {
-            tracing::warn!(node = %id, "a node has ended without a word: its cameras are free");
+            tracing::warn!(node = %id, "a node has ended without releasing its cameras: they are free");
         }
     }
     Ok(())

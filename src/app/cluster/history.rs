@@ -1,5 +1,5 @@
-//! What a node does where the database goes on from before what it has acknowledged, as after a fail-over to a standby
-//! that had not received everything.
+//! The actions of a node when the database continues from an earlier state than it has acknowledged, as after a
+//! fail-over to a standby that had not received everything.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,12 +10,12 @@ use crate::app::App;
 use crate::app::live::sync::lock;
 use crate::store::HistoryMark;
 
-/// Whether what this process knows is of the history that the database has.
+/// The history of what this process knows, compared with that of the database.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DatabaseHistory {
-    /// It is.
+    /// The known state is of the database's history.
     Unbroken,
-    /// It may not be, and is being read again.
+    /// It may not be, and is read again.
     Reading,
     /// Everything was read again after the history broke at this time.
     BrokenAt(Timestamp),
@@ -59,7 +59,7 @@ impl HistoryWatch {
         self.breaks.load(Ordering::Acquire)
     }
 
-    /// Notes that everything was read again after so many breaks.
+    /// Notes that everything was read again after this number of breaks.
     pub(super) fn has_read_after(&self, breaks: u64) {
         self.read_after.store(breaks, Ordering::Release);
     }

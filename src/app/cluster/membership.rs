@@ -228,7 +228,8 @@ impl Membership {
         1 + lock(&self.others).values().filter(is_serving).count()
     }
 
-    /// What a client hears whose camera or site another node owns: its address, unless that node seems to be gone or is going.
+    /// The refusal for a camera or site that another node owns. It has that node's address, unless the node seems to be
+    /// gone or is shutting down.
     pub(super) fn elsewhere(&self, owned: &str, owner: NodeId, now: Duration) -> Error {
         let others = lock(&self.others);
         let reachable = others.get(&owner).filter(|other| {

@@ -44,12 +44,12 @@ enum Joined {
     Shared(Box<Membership>),
 }
 
-/// What a process tells the others of itself.
+/// The description of a process for the others.
 #[derive(Debug, Clone)]
 pub struct NodeSettings {
     /// Where clients reach it.
     pub url: Option<String>,
-    /// What it does.
+    /// The role of the process.
     pub role: NodeRole,
     /// How long it counts as alive without another renewal.
     pub lease: Duration,
@@ -71,11 +71,10 @@ impl NodeSettings {
 /// A node, for operators.
 #[derive(Debug, Clone)]
 pub struct NodeStatus {
-    /// The node.
     pub node: Node,
     /// Cameras that it owns.
     pub cameras: u64,
-    /// Whether it is this process.
+    /// True if it is this process.
     pub is_this: bool,
 }
 
@@ -118,7 +117,7 @@ impl App {
             Some(leases) => {
                 let sent_at = self.clock.monotonic();
                 let mark = leases.register(id, &profile, heartbeat::random(self)).await?;
-                // What is read from here on is of that history, or of a later one that a renewal notices.
+                // Everything read from here on is of that history, or of a later one that a renewal notices.
                 self.access.set_lease(lease);
                 self.access.refresh(&self.store, &self.clock).await?;
                 let registration = Registration::new(id, sent_at);
@@ -188,7 +187,7 @@ impl App {
         membership.map_or_else(Watch::default, |it| it.watches.begin(Watched::Site(site)))
     }
 
-    /// Whether what this process knows is of the history that the database has.
+    /// Compares the history of what this process knows with that of the database.
     #[must_use]
     pub fn database_history(&self) -> DatabaseHistory {
         let membership = self.cluster.membership();

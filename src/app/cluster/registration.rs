@@ -17,7 +17,7 @@ impl Registration {
         Self { id, valid_until_ns: AtomicU64::new(as_ns(valid_until)) }
     }
 
-    /// Whether the node surely still owns what it owned.
+    /// True if the node certainly still owns what it owned.
     pub(super) fn is_valid(&self, now: Duration) -> bool {
         as_ns(now) < self.valid_until_ns.load(Ordering::Acquire)
     }

@@ -8,7 +8,7 @@ use tokio_util::sync::CancellationToken;
 use crate::app::live::sync::lock;
 use crate::domain::{CameraKey, SiteKey};
 
-/// What is read.
+/// A camera or site that is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Watched {
     Camera(CameraKey),
@@ -28,7 +28,7 @@ impl Watch {
         }
     }
 
-    /// Whether another node has become the owner, or may have.
+    /// True if another node has become the owner, or may have.
     #[must_use]
     pub fn has_ended(&self) -> bool {
         self.0.as_ref().is_some_and(|ended| ended.is_cancelled())
@@ -50,7 +50,7 @@ impl Watches {
         Watch(Some(ended))
     }
 
-    /// What is read now.
+    /// Returns the cameras and sites that are read now.
     pub(super) fn watched(&self) -> (Vec<CameraKey>, Vec<SiteKey>) {
         let mut watches = lock(&self.0);
         watches.retain(|_, watch| watch.strong_count() > 0);

@@ -5,7 +5,7 @@ use crate::domain::Result;
 use crate::telemetry::OutsideFigures;
 
 impl App {
-    /// What the connections of this node do.
+    /// The figures of the connections of this node.
     ///
     /// # Errors
     /// A fault of the store.

@@ -16,7 +16,7 @@ enum Place {
 struct Group {
     keys: Vec<ConnectionKey>,
     places: HashSet<Place>,
-    /// Whether its messages may be for any camera.
+    /// True if its messages may be for any camera.
     is_for_any: bool,
 }
 

@@ -31,19 +31,18 @@ pub use status::{
     PushedMessage,
 };
 
-/// A source that was created or resumed begins beside the answer; a message that comes before it waits for at most so long.
+/// A pushed message waits at most this long for a source that was just created or resumed.
 const SOURCE_START: Duration = Duration::from_secs(2);
 
 /// A connection as a caller describes it.
 #[derive(Debug, Clone)]
 pub struct ConnectionRequest {
-    /// Its id.
     pub id: ConnectionId,
     /// The name for people; the id if left out.
     pub display_name: Option<String>,
-    /// Whether it is at rest.
+    /// True if it is paused.
     pub paused: bool,
-    /// What it does.
+    /// The settings of its source or sink.
     pub settings: ConnectionSettings,
     /// Secrets to be set, or removed.
     pub secrets: BTreeMap<String, Option<String>>,
@@ -228,7 +227,7 @@ impl App {
         Ok(())
     }
 
-    /// What a connection does, the node that runs it if several share the database, and what is in its outbox.
+    /// The status of a connection, the node that runs it if several share the database, and the counts of its outbox.
     ///
     /// # Errors
     /// A fault of the store.

@@ -4,8 +4,8 @@ use crate::app::App;
 use crate::domain::{ConnectionKey, OutboxLog, OutboxMessage, Result};
 
 impl App {
-    /// Appends messages of this process's log to the outbox of a sink; how many of the oldest were dropped for the limit.
-    /// What the outbox has from an attempt whose outcome was not heard is left out.
+    /// Appends messages of this process's log to the outbox of a sink. Returns the number of the oldest messages that
+    /// were dropped for the limit. Messages that an earlier attempt stored without an answer are left out.
     ///
     /// # Errors
     /// The store cannot be written; then none is appended, or all are and the next attempt finds them.

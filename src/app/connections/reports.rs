@@ -1,4 +1,4 @@
-//! What connections do, as every node shows it.
+//! The status of connections, as every node shows it.
 
 use std::collections::HashMap;
 
@@ -10,13 +10,12 @@ use crate::store::ConnectionReports;
 /// The node that runs a connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ConnectionNode {
-    /// Its id.
     pub id: NodeId,
     /// Where clients reach it, if that is known.
     pub url: Option<String>,
 }
 
-/// What this node has reported to the others.
+/// The statuses that this node has reported to the others.
 #[derive(Default)]
 pub struct ReportedStatuses {
     node: Option<NodeId>,
@@ -34,7 +33,7 @@ impl App {
             reported.statuses.clear();
         }
         let mut statuses = self.connection_board.statuses();
-        // What nothing is known of needs no report.
+        // A status that equals the reported one needs no report.
         statuses.retain(|key, status| *reported.statuses.entry(*key).or_default() != *status);
         if statuses.is_empty() {
             return Ok(());
@@ -47,7 +46,7 @@ impl App {
         Ok(())
     }
 
-    /// What a connection does, whichever node runs it, and that node. Counts are those of all nodes.
+    /// The status of a connection, whichever node runs it, and that node. Counts are those of all nodes.
     ///
     /// # Errors
     /// The database does not answer.

@@ -1,4 +1,4 @@
-//! What connections do now: state, counts, the last message. In memory, since the server was started.
+//! The present status of connections: state, counts, the last message. In memory, since the server was started.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -34,18 +34,18 @@ pub enum ConnectionState {
 /// A message as it came or went, with what was read from it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LastMessage {
-    /// When.
+    /// The time of the message.
     pub time: Timestamp,
     /// Its topic, or the address of its sender.
     pub subject: String,
-    /// Its beginning.
+    /// The beginning of the payload, as text.
     pub text: String,
-    /// What it says: its items, what was skipped, or why it cannot be read.
+    /// Its items, what was skipped, or why it cannot be read.
     pub reading: Vec<String>,
 }
 
 impl LastMessage {
-    /// Of a payload, of which the first 4 KiB are kept.
+    /// Makes the last message of a payload and keeps its first 4 KiB.
     #[must_use]
     pub fn new(time: Timestamp, subject: String, payload: &[u8], reading: Vec<String>) -> Self {
         let shown = &payload[..payload.len().min(SHOWN_BYTES)];
@@ -58,9 +58,9 @@ impl LastMessage {
 pub struct CountedReason {
     /// The reason, of the latest of them.
     pub reason: String,
-    /// How many there were.
+    /// Number of messages or parts.
     pub count: u64,
-    /// What the latest of them was: an item in words, or the beginning of a message.
+    /// The latest example: an item in words, or the beginning of a message.
     pub example: String,
     /// When that came.
     pub last_at: Timestamp,
@@ -77,15 +77,14 @@ fn without_numbers(reason: &str) -> impl Iterator<Item = char> {
     reason.chars().filter(|own| !own.is_ascii_digit())
 }
 
-/// What a connection does.
+/// The status of a connection.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ConnectionStatus {
-    /// State.
     pub state: ConnectionState,
-    /// Since when.
+    /// The time of the latest change of the state.
     pub since: Option<Timestamp>,
-    /// What failed last, and when.
+    /// The last error and its time.
     pub last_error: Option<(Timestamp, String)>,
     /// The last message.
     pub last_message: Option<LastMessage>,
@@ -160,7 +159,6 @@ impl ConnectionStatus {
 pub struct PushedMessage {
     /// Who sends it.
     pub sender: String,
-    /// Content.
     pub payload: Bytes,
     /// Answered when what was to be stored is stored: the error of a message that cannot be read.
     pub settled: oneshot::Sender<Result<(), String>>,
@@ -179,7 +177,7 @@ pub struct LiveConnection {
 }
 
 impl LiveConnection {
-    /// What it does now.
+    /// Returns the present status.
     #[must_use]
     pub fn status(&self) -> ConnectionStatus {
         lock(&self.status).clone()
@@ -244,7 +242,7 @@ impl ConnectionBoard {
         live.iter().map(|(id, (key, connection))| (id.clone(), *key, connection.status())).collect()
     }
 
-    /// What is known of each.
+    /// Returns the status of each connection.
     pub(super) fn statuses(&self) -> HashMap<ConnectionKey, ConnectionStatus> {
         lock(&self.live).values().map(|(key, connection)| (*key, connection.status())).collect()
     }

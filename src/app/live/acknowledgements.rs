@@ -1,4 +1,4 @@
-//! What a stream has handed in, and what of it is settled: stored, or known not to become a sample.
+//! The items that a stream has handed in, and those that are settled: stored, or known not to become a sample.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
@@ -35,15 +35,14 @@ impl NotStoredReason {
 /// Items of a stream that are not part of a sample for one reason.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NotStored {
-    /// Why.
     pub reason: NotStoredReason,
-    /// How many, since the stream was opened.
+    /// Number of them since the stream was opened.
     pub count: u64,
     /// The latest of them.
     pub last_seq: u64,
 }
 
-/// What a stream may acknowledge.
+/// The acknowledgement of a stream's items.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Acknowledgement {
     /// Every item up to this seq is settled.
@@ -107,7 +106,7 @@ impl AckTracker {
         PendingAck { tracker: self.clone(), seq }
     }
 
-    /// What is settled.
+    /// Returns the items that are settled.
     pub(super) fn acknowledgement(&self) -> Acknowledgement {
         let state = lock(&self.state);
         let not_stored = NotStoredReason::ALL.into_iter().zip(state.not_stored);
@@ -121,7 +120,7 @@ impl AckTracker {
         }
     }
 
-    /// Whether nothing is outstanding.
+    /// True if nothing is outstanding.
     ///
     /// # Errors
     /// The samples could not be committed.

@@ -1,7 +1,7 @@
 //! Residuals on their way to the drift detectors, and the alarms that come of them.
 //!
 //! Answers hand residuals to one task and never wait for it: detecting costs time and an alarm goes to
-//! the database. Where the task falls behind, residuals are dropped, for a camera that moved goes on
+//! the database. If the task is too slow, residuals are dropped, for a camera that moved goes on
 //! producing them.
 
 use std::sync::{Arc, Weak};
@@ -39,7 +39,7 @@ impl ResidualQueue {
     }
 }
 
-/// What waits, for the task.
+/// The residuals that wait for the task.
 pub(in crate::app) struct WaitingResiduals {
     receiver: mpsc::Receiver<PairResidual>,
     closed: CancellationToken,
@@ -79,7 +79,7 @@ impl App {
     /// Hands a residual to the camera's drift detector.
     pub(super) fn hand_over(&self, camera: &Arc<ActiveCamera>, residual: ResidualSample) {
         if self.residuals.sender.try_send(PairResidual { camera: camera.clone(), residual }).is_err() {
-            tracing::debug!(camera.id = %camera.id, "a residual was dropped, the drift detectors are behind");
+            tracing::debug!(camera.id = %camera.id, "a residual was dropped, the queue of the drift detectors is full");
         }
     }
 

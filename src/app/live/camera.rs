@@ -15,22 +15,24 @@ use super::matching::LiveMatching;
 use super::sample_recorder::SampleRecorder;
 use super::sync::lock;
 use super::tracks::{TrackPoint, Tracks};
-use crate::domain::{BoundingBox, CameraMoved, FusedFix};
+use crate::domain::{BoundingBox, CameraMoved, FusedFix, Score, TargetClass, TargetId, TrackerId};
 
 /// When something was observed, by the server's clock.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Observed {
-    /// Last.
+    /// The time of the last one.
     pub(super) last_at: Option<Timestamp>,
     /// Since when every box was frozen.
     pub(super) frozen_since: Option<Timestamp>,
 }
 
-/// What happens in a camera's view.
+/// An event in a camera's view.
 #[derive(Debug, Clone)]
 pub enum CameraEvent {
     /// A target was measured.
     Track(Arc<TargetUpdate>),
+    /// A box was seen that has no position: the camera has no model.
+    Box(Arc<UnplacedBox>),
     /// The camera's pose has changed.
     Moved(Arc<CameraMoved>),
 }
@@ -44,6 +46,23 @@ pub struct TargetUpdate {
     pub bounding_box: Option<BoundingBox>,
     /// The observation's own position; `None` for a box while the camera has no model.
     pub fused: Option<FusedFix>,
+}
+
+/// A box of a camera that has no model.
+#[derive(Debug)]
+pub struct UnplacedBox {
+    /// Time of the frame.
+    pub time: Timestamp,
+    /// The target, where the detector knows it.
+    pub target_id: Option<TargetId>,
+    /// The id that the camera's tracker gave it.
+    pub tracker_id: Option<TrackerId>,
+    /// The box.
+    pub bounding_box: BoundingBox,
+    /// Class reported by the detector.
+    pub class: Option<TargetClass>,
+    /// Confidence score of the detector.
+    pub score: Option<Score>,
 }
 
 /// Tracks, drift detection, listeners and the recording of samples of one camera.
@@ -106,7 +125,7 @@ impl CameraLive {
         self.replaced.cancelled().await;
     }
 
-    /// Whether the camera is deleted.
+    /// True if the camera is deleted.
     #[cfg(test)]
     pub(in crate::app) fn is_deleted(&self) -> bool {
         self.deleted.is_cancelled()
@@ -122,6 +141,11 @@ impl CameraLive {
         self.events.push(now, || CameraEvent::Track(Arc::new(update())));
     }
 
+    /// The same for a box without a position.
+    pub(super) fn announce_box(&self, now: Duration, unplaced: impl FnOnce() -> UnplacedBox) {
+        self.events.push(now, || CameraEvent::Box(Arc::new(unplaced())));
+    }
+
     /// Remembers that something was observed at that time of the server, and whether its box, if it has one, is frozen.
     pub(super) fn observed(&self, now: Timestamp, is_frozen: Option<bool>) {
         let mut observed = lock(&self.observed);
@@ -133,7 +157,7 @@ impl CameraLive {
         }
     }
 
-    /// What was observed since the server was started.
+    /// Returns the counts of what was observed since the server was started.
     pub(super) fn latest_observed(&self) -> Observed {
         *lock(&self.observed)
     }

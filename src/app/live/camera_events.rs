@@ -1,7 +1,7 @@
 //! The latest events of one camera, for readers that come back.
 //!
 //! Events are kept while somebody listens, and for some time after, so that a reader whose connection broke misses
-//! none. Never here: a writer waits for readers, memory grows with the time that a reader is away.
+//! none. A writer does not wait for readers, and memory does not grow with the time that a reader is away.
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,7 +11,7 @@ use std::time::Duration;
 use super::event_log::{EventLog, EventReader, NextEvent};
 use super::sync::lock;
 
-/// Events that a reader may lag behind, or be away for, before it loses some.
+/// Latest events that are kept; a reader that is away for more events loses the oldest.
 const CAPACITY: usize = 1_024;
 /// How long events are kept without a reader.
 const KEPT_WITHOUT_READER: Duration = Duration::from_secs(60);

@@ -42,11 +42,11 @@ impl<T> EventLog<T> {
     }
 }
 
-/// What a reader reads next.
+/// The next event of a reader.
 pub(super) enum NextEvent<T> {
     /// An event with its number.
     Event(u64, Arc<T>),
-    /// So many events after the reader's place are not kept any more; the number is that of the last of them.
+    /// Number of events after the reader's place that are not kept any more, and the number of the last of them.
     Lost(u64, u64),
 }
 

@@ -25,7 +25,7 @@ pub(super) struct Identified {
     pub(super) observation: Observation,
     /// The receiver, if the box was matched.
     pub(super) receiver_match: Option<ReceiverMatch>,
-    /// Whether its target is sure enough for a sample.
+    /// True if its target is sure enough for a sample.
     pub(super) is_sure: bool,
 }
 

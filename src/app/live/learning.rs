@@ -1,4 +1,4 @@
-//! What a camera without a model records to learn from: boxes that have only a tracker's id, and fixes of receivers.
+//! The recording of a camera without a model: boxes that have only a tracker's id, and fixes of receivers.
 //!
 //! Rows wait in memory until a task stores them, about once a second, so an item never waits for the database.
 
@@ -84,13 +84,13 @@ fn remember(intervals: &mut BTreeSet<i64>, time: Timestamp) {
 #[derive(Debug, Clone)]
 pub(in crate::app) struct LearningAttempt {
     pub(in crate::app) at: Timestamp,
-    /// What came of it, as a sentence.
+    /// The outcome, as a sentence.
     pub(in crate::app) outcome: String,
     /// Time that had been recorded, s.
     common_s: u64,
 }
 
-/// What is known of a camera's learning.
+/// The progress of a camera's learning.
 #[derive(Debug, Clone)]
 pub(in crate::app) struct LearningProgress {
     pub(in crate::app) extent: RecordedExtent,
@@ -109,7 +109,7 @@ struct State {
     pending: Recording,
     dropped: u64,
     extent: RecordedExtent,
-    /// Whether `extent` has what an earlier run of the server stored.
+    /// True if `extent` has what an earlier run of the server stored.
     is_complete: bool,
     kept_at: HashMap<TargetId, Timestamp>,
     is_matching: bool,
@@ -137,7 +137,7 @@ impl LiveLearning {
         }
     }
 
-    /// Whether rows wait for their storage.
+    /// True if rows wait to be stored.
     pub(in crate::app) fn is_pending(&self) -> bool {
         let state = lock(&self.0);
         !state.pending.detections.is_empty() || !state.pending.fixes.is_empty()
@@ -149,7 +149,7 @@ impl LiveLearning {
         (std::mem::take(&mut state.pending), std::mem::take(&mut state.dropped))
     }
 
-    /// Whether it is known how much was stored.
+    /// True if it is known how much was stored.
     pub(in crate::app) fn is_complete(&self) -> bool {
         lock(&self.0).is_complete
     }
@@ -173,7 +173,7 @@ impl LiveLearning {
         }
     }
 
-    /// Whether an attempt begins now; [`Self::end_attempt`] ends it.
+    /// True if an attempt begins now; [`Self::end_attempt`] ends it.
     pub(in crate::app) fn begin_attempt(&self) -> bool {
         let mut state = lock(&self.0);
         let begins = !state.is_matching && state.extent.common_s() >= state.needed_s();

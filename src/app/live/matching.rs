@@ -78,7 +78,7 @@ impl LiveMatching {
         }
     }
 
-    /// Whether a round is to begin now, by the monotonic clock; [`Self::end_round`] ends it.
+    /// True if a round is to begin now, by the monotonic clock; [`Self::end_round`] ends it.
     pub(super) fn begin_round(&self, now: Duration) -> bool {
         let mut state = lock(&self.state);
         let begins = !state.is_running && now >= state.next_at && state.window.can_be_matched();
@@ -103,14 +103,14 @@ impl LiveMatching {
         Ok(())
     }
 
-    /// Ends a round that began at a reading of the monotonic clock and took so long.
+    /// Ends a round that began at `begun`, by the monotonic clock, and took `taken`.
     pub(super) fn end_round(&self, begun: Duration, taken: Duration) {
         let mut state = lock(&self.state);
         state.is_running = false;
         state.next_at = begun + MIN_PERIOD.max(taken.div_f64(MAX_LOAD));
     }
 
-    /// Whether a match is sure enough for a sample.
+    /// True if a match is sure enough for a sample.
     pub(super) fn is_sure(&self, matched: &ReceiverMatch) -> bool {
         matched.probability >= self.settings.matched_from
     }

@@ -35,7 +35,7 @@ use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
 use super::cluster::{CameraLease, Watch};
-use super::fusion::fuse_observed;
+use super::fusion::fuse_for_camera;
 use super::registry::ActiveCamera;
 use crate::domain::{
     CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, ReceiverMatch, Result, TargetId,
@@ -46,7 +46,7 @@ use crate::fusion::observed::ObservedPositions;
 
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
-pub use camera::{CameraEvent, TargetUpdate};
+pub use camera::{CameraEvent, TargetUpdate, UnplacedBox};
 pub use camera_events::{EventId, LostEvents};
 pub(super) use identification::MatchingSlot;
 pub(super) use learning::LearningProgress;
@@ -60,7 +60,7 @@ pub(super) use stream::StreamSlots;
 pub use stream::{ChangeNotices, LiveStream};
 pub use tracks::TrackPoint;
 
-/// What became of one live observation.
+/// The result of one live observation.
 #[derive(Debug, Clone)]
 pub struct ItemResult {
     /// Its own position; `None` for a box while the camera has no model.
@@ -73,7 +73,7 @@ pub struct ItemResult {
     pub receiver_match: Option<ReceiverMatch>,
 }
 
-/// What happens in a camera's view, since the server was started.
+/// The activity in a camera's view, since the server was started.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct CameraActivity {
     /// Targets that are tracked now.
@@ -94,7 +94,7 @@ pub struct CameraEvents {
 }
 
 impl CameraEvents {
-    /// Whether they have ended since they continue elsewhere: the reader should ask again.
+    /// True if they have ended since they continue elsewhere: the reader should ask again.
     #[must_use]
     pub fn continue_elsewhere(&self) -> bool {
         self.watch.has_ended() || self.live.is_replaced()
@@ -119,7 +119,7 @@ impl App {
         TimeBounds::live_at(now, self.limits.live_ahead_s)
     }
 
-    /// What live observations of a camera must satisfy.
+    /// The rules for live observations of a camera.
     #[must_use]
     pub fn live_rules(&self, camera: &ActiveCamera) -> RowRules {
         RowRules { time_bounds: self.live_time_bounds(self.clock.now()), image_size: camera.image_size }
@@ -130,7 +130,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraBetweenNodes` if the lease has ended; `InvalidArgument` naming `time` for a time ahead of the
-    /// server's clock; `Overloaded` if the camera tracks as many targets as it may.
+    /// server's clock; `Overloaded` if the camera has reached its limit of targets.
     pub fn follow(
         &self,
         (camera, lease): (&Arc<ActiveCamera>, &CameraLease),
@@ -169,7 +169,7 @@ impl App {
             Some(target) => target.observe(observation, regressor, image_size, e_gnss_m2),
             None => ObservedPositions::of(observation, regressor, image_size, e_gnss_m2, None),
         };
-        let fused = fuse_observed(camera, observation, &observed);
+        let fused = fuse_for_camera(camera, observation, &observed);
         self.metrics.fused(fused.as_slice());
         camera.live.observed(observed_at, observed.regressed.map(|seen| seen.is_frozen));
         let world_track = self.feed_site(camera, observation, &observed);
@@ -194,7 +194,7 @@ impl App {
         Ok(ItemResult { fused, track, world_track, receiver_match })
     }
 
-    /// What happens in a camera's view.
+    /// Returns the activity in a camera's view.
     pub(super) fn activity(&self, camera: &ActiveCamera) -> CameraActivity {
         let observed = camera.live.latest_observed();
         CameraActivity {
@@ -256,7 +256,7 @@ impl App {
         Ok(CameraEvents { reader: camera.live.events.reader(last_seen), live: camera.live.clone(), watch })
     }
 
-    /// Whether a camera's active model no longer fits what the camera sees.
+    /// Returns the detected movement of a camera if its active model no longer fits what the camera sees.
     #[must_use]
     pub fn camera_moved(&self, id: &CameraId) -> Option<Arc<CameraMoved>> {
         self.registry.get(id)?.moved.clone()

@@ -28,7 +28,7 @@ impl RetrainSchedule {
         lock(&self.0).retain(|key, _| waiting.contains(key));
     }
 
-    /// Whether an attempt is due; if so, the next one is `pause` doubled with every attempt away.
+    /// True if an attempt is due; then the next one is after `pause`, doubled with every attempt.
     fn take_due(&self, key: (CameraKey, u32), now: Duration, pause: Duration) -> bool {
         let mut schedule = lock(&self.0);
         let attempts = schedule.entry(key).or_default();

@@ -57,7 +57,7 @@ impl SampleRecorder {
         (Arc::new(Self { pending: Mutex::new(pending), commits, settings }), queue)
     }
 
-    /// Whether nothing more can be recorded: a commit has failed.
+    /// True if nothing more can be recorded: a commit has failed.
     pub(super) fn has_failed(&self) -> bool {
         self.commits.is_closed()
     }
@@ -135,7 +135,7 @@ impl SampleRecorder {
     }
 }
 
-/// The queue is closed by a commit that failed, and never else while a stream holds the recorder: a
+/// While a stream holds the recorder, only a commit that failed closes the queue: a
 /// stream that had nothing in that commit must end too, or it would acknowledge what is not stored.
 fn stopped(tracker: &AckTracker) -> Error {
     tracker.fail(ErrorKind::Internal)

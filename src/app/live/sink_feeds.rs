@@ -2,7 +2,7 @@
 //!
 //! The feed of a sink is a log of the positions of its cameras, from the moment they are made until they are in its outbox,
 //! however long the database does not answer. Cameras are known by their ids: one that is created later, or comes back from
-//! another node, misses nothing. Never here: a track waits for a sink; memory grows without a limit.
+//! another node, misses nothing. A track does not wait for a sink, and memory has a limit.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Mutex};
@@ -33,20 +33,19 @@ pub struct SinkPosition {
     pub number: u64,
     /// The camera that tracks the target.
     pub camera: CameraId,
-    /// What it was made of.
+    /// The observation from which the position was computed.
     pub observation: Observation,
     /// The track with it.
     pub point: Arc<TrackPoint>,
 }
 
-/// What a sink wants.
+/// The positions that a sink requests.
 #[derive(Debug, Clone)]
 pub struct WantedPositions {
-    /// The sink.
     pub key: ConnectionKey,
-    /// Of these cameras.
+    /// Only positions of these cameras.
     pub cameras: Vec<CameraId>,
-    /// Of each target at most one in so many seconds.
+    /// The least time between two positions of a target, s.
     pub min_interval_s: f64,
 }
 
@@ -113,7 +112,7 @@ impl SinkFeed {
         positions.drain(..settled);
     }
 
-    /// How many positions were lost since the last call, for the outbox took none for too long.
+    /// Number of positions lost since the last call, for the outbox took none for too long.
     #[must_use]
     pub fn take_lost(&self) -> u64 {
         std::mem::take(&mut lock(&self.waiting).lost)
@@ -125,7 +124,7 @@ impl SinkFeed {
 }
 
 impl Waiting {
-    /// Whether a target's last position was taken long enough ago.
+    /// True if a target's last position was taken long enough ago.
     fn is_due(&mut self, camera: &CameraId, point: &TrackPoint) -> bool {
         let (interval_s, time_s) = (self.min_interval_s, point.state.time.as_microsecond() as f64 * 1e-6);
         if !self.last_sent_s.contains_key(camera) {

@@ -9,7 +9,7 @@ use tokio::sync::watch;
 
 use super::ItemResult;
 use super::acknowledgements::{AckTracker, Acknowledgement, NotStoredReason};
-use super::camera::StreamCount;
+use super::camera::{StreamCount, UnplacedBox};
 use super::sample_committer::{self, SampleSink};
 use super::sample_recorder::{SampleRecorder, UnpairedItem};
 use super::sync::lock;
@@ -145,12 +145,9 @@ impl App {
         let mut stream = self.open_stream(&camera.id, &name, client, 0, Some(durability)).await?;
         let mut followed = Vec::with_capacity(observations.len());
         for (seq, observation) in (1..).zip(observations) {
-            let tracker_id = observation.tracker_id().cloned();
-            let (time, target_id, bounding_box, fix) = observation.into_parts();
-            let (receiver_id, class, score) = (None, None, None);
-            let item = LiveItem { time, target_id, tracker_id, receiver_id, bounding_box, fix, class, score };
             stream.check_seq(seq)?;
-            followed.push(stream.take(camera, seq, item, self.clock.now()).await?);
+            let now = self.clock.now();
+            followed.push(stream.observe(camera, (seq, now), observation, (None, None)).await?);
         }
         // Deciding early would take other requests' and streams' items from each other.
         stream.settle_within(PAIRING_PATIENCE).await?;
@@ -261,8 +258,6 @@ impl LiveStream {
         item: LiveItem,
         now: Timestamp,
     ) -> Result<ItemResult> {
-        let lease = self.lease()?;
-        lease.check(self.app.clock.monotonic())?;
         let (target_id, time, fix) = match (item.target_id, &item.receiver_id) {
             (None, Some(receiver_id)) => {
                 let (target_id, time) = camera.receivers.resolve(receiver_id, item.time);
@@ -273,15 +268,38 @@ impl LiveStream {
         };
         let observation =
             Observation::new(time, target_id, item.bounding_box, fix)?.with_tracker_id(item.tracker_id)?;
+        self.observe(camera, (seq, now), observation, (item.class, item.score)).await
+    }
+
+    /// Takes an observation as [`LiveStream::take`] does. The lease is checked where the live state changes; a sample that
+    /// was recorded before is a duplicate once the client repeats the item.
+    async fn observe(
+        &self,
+        camera: &Arc<ActiveCamera>,
+        (seq, now): (u64, Timestamp),
+        observation: Observation,
+        (class, score): (Option<TargetClass>, Option<Score>),
+    ) -> Result<ItemResult> {
         // A time that no track takes must not move the pairing either.
+        let time = observation.time();
         self.app.live_time_bounds(now).check(time)?;
-        let identified = self.app.identify(camera, observation, item.class.as_ref());
+        if let Some(bounding_box) = observation.bounding_box().filter(|_| camera.model().is_none()) {
+            camera.live.announce_box(self.app.clock.monotonic(), || UnplacedBox {
+                time,
+                target_id: observation.target_id().cloned(),
+                tracker_id: observation.tracker_id().cloned(),
+                bounding_box,
+                class: class.clone(),
+                score,
+            });
+        }
+        let identified = self.app.identify(camera, observation, class.as_ref());
         if identified.is_sure {
-            self.record(seq, &identified.observation, item.class, item.score).await?;
+            self.record(seq, &identified.observation, class, score).await?;
         } else {
             self.ack_without_storing(seq, NotStoredReason::Unmatched);
         }
-        self.app.follow_identified((camera, lease), identified, now)
+        self.app.follow_identified((camera, self.lease()?), identified, now)
     }
 
     async fn record(
@@ -313,7 +331,7 @@ impl LiveStream {
         }
     }
 
-    /// What is settled; `None` on a stream that stores nothing.
+    /// Returns the items that are settled; `None` on a stream that stores nothing.
     ///
     /// # Errors
     /// The samples could not be stored; the stream must end, for nothing after them is acknowledged.
@@ -348,7 +366,7 @@ impl LiveStream {
         self.settle_within(if is_alone { Duration::ZERO } else { recorder.allowed_lateness() }).await
     }
 
-    /// Waits for so long until everything is settled, then decides the rest.
+    /// Waits until everything is settled, for at most `patience`, then decides the rest.
     async fn settle_within(&self, patience: Duration) -> Result<()> {
         let Some(StreamRecording { recorder, tracker }) = &self.recording else { return Ok(()) };
         // Elapsed is no failure: the rest is decided below.

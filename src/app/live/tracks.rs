@@ -25,9 +25,8 @@ const EVICT_AFTER: Duration = Duration::from_secs(2);
 /// Where a target is by its track, at the latest instant measured.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrackPoint {
-    /// The target.
     pub target_id: TargetId,
-    /// Where.
+    /// The target's position.
     pub position: Position,
     /// All that the track states, in its own plane.
     pub state: TrackState,
@@ -131,7 +130,7 @@ fn evict_longest_silent(targets: &mut Targets, now: Duration) {
 }
 
 impl TrackedTarget {
-    /// What an observation measures, seen beside the target's latest boxes.
+    /// Returns the positions that an observation measures, compared with the target's latest boxes.
     pub(super) fn observe<'a>(
         &mut self,
         observation: &Observation,

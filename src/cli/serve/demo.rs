@@ -15,8 +15,7 @@ use tokio_util::sync::CancellationToken;
 use crate::app::{App, RunRequest};
 use crate::cli::progress::Progress;
 use crate::doctor::reachable;
-use crate::domain::{CameraId, Durability, GnssError, JobState, NewCamera, Observation, SigmaM};
-use crate::exchange::ObservedRow;
+use crate::domain::{CameraId, Durability, GnssError, JobState, LiveItem, NewCamera, SigmaM};
 use crate::replay::{Counters, FaultShares, Pace, RecordedStream, ReplayOptions, replay};
 use crate::simulation::{Options, SimulatedRow, simulate};
 
@@ -26,7 +25,7 @@ const CAMERA: &str = "demo";
 const TARGETS: usize = 8;
 /// Rows of the walk, which then begins again.
 const ROWS: usize = 20_000;
-/// Of the targets, those that carry a phone.
+/// Number of targets that carry a phone.
 const PHONES: usize = 2;
 /// Every so often one phone loses GNSS, and its track goes on by the boxes alone.
 const GNSS_LOSS_EVERY_S: i64 = 60;
@@ -109,13 +108,21 @@ pub(super) async fn walk(address: SocketAddr, now: Timestamp) -> anyhow::Result<
     Ok(())
 }
 
-/// What camera and phones give of a row; `None` if nothing.
-fn observed(row: &SimulatedRow, first: Timestamp) -> Option<ObservedRow> {
+/// The item of a row by camera and phones; `None` if nothing.
+fn observed(row: &SimulatedRow, first: Timestamp) -> Option<LiveItem> {
     let elapsed_s = row.time.duration_since(first).as_secs();
     let is_denied = row.target == 0 && elapsed_s % GNSS_LOSS_EVERY_S >= GNSS_LOSS_EVERY_S - GNSS_LOSS_S;
     let fix = row.fix.filter(|_| row.target < PHONES && !is_denied);
-    let observation = Observation::new(row.time, Some(row.target_id.clone()), row.bounding_box, fix).ok()?;
-    Some(ObservedRow { observation, class: Some(row.class.clone()), score: None, truth: None })
+    (row.bounding_box.is_some() || fix.is_some()).then(|| LiveItem {
+        time: row.time,
+        target_id: Some(row.target_id.clone()),
+        tracker_id: None,
+        receiver_id: None,
+        bounding_box: row.bounding_box,
+        fix,
+        class: Some(row.class.clone()),
+        score: None,
+    })
 }
 
 fn requests_to_try(address: SocketAddr, row: &SimulatedRow) -> String {

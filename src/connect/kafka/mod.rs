@@ -1,129 +1,119 @@
 //! Kafka: a source of topics, and a sink.
 //!
-//! The library has no consumer groups. A source reads every partition of its topics, and the store keeps the offset
+//! A source reads every partition of its topics, and the store keeps the offset
 //! after the last message whose content is stored: what came after it is read again after a crash. A new source begins
 //! with the messages that come from then on; partitions that are added later are read from their beginning. A sink counts
 //! a message as delivered when all replicas in sync have it.
+//!
+//! There is one connection to each broker that leads partitions. Any failure, a change of leaders too, ends all of them, and the
+//! connection as a whole is opened again.
 
+mod batch;
+mod broker;
+mod decompress;
+mod fields;
+mod requests;
 mod sink;
 mod source;
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use rskafka::BackoffConfig;
-use rskafka::client::error::{Error, ProtocolError};
-use rskafka::client::partition::{PartitionClient, UnknownTopicHandling};
-use rskafka::client::{Client, ClientBuilder, Credentials as UserAndPassword, SaslConfig};
+use tokio::sync::Mutex;
 
+use self::broker::{Broker, Dialer};
+use self::requests::{BrokerEntry, ErrorCode, Metadata, TopicEntry};
 use super::credentials::{Credentials, PeerError};
-use super::peer::{OPEN_TIME, within};
-use super::tls;
-use crate::exchange::{Address, SaslMechanism, Scheme, bracketed};
+use crate::exchange::Address;
 
 pub(super) use sink::KafkaSink;
 pub(super) use source::SourceReader;
 
-/// Largest answer of a broker that is read, bytes. A broker sends at least one batch of records, however large it is.
-const MAX_ANSWER_BYTES: usize = 64 << 20;
-/// Partitions that a connection may read, or keep open for writing; each has a TCP connection of its own.
+/// Partitions that a connection may read, and topics and brokers that it may keep for writing.
 const MAX_PARTITIONS: usize = 256;
 /// How often the brokers are asked for their topics.
 const LOOK_EVERY: Duration = Duration::from_secs(10);
+/// How long, and how often, a topic without leaders is waited for.
+const NEW_TOPIC_PAUSE: Duration = Duration::from_millis(200);
+const NEW_TOPIC_TRIES: u32 = 5;
 
-impl From<Error> for PeerError {
-    fn from(error: Error) -> Self {
-        Self(error.to_string())
-    }
-}
-
-/// Partitions by topic.
-type Topics = BTreeMap<String, Vec<i32>>;
+/// Host and port of a broker.
+type Node = (String, u16);
+/// The leaders of a topic by partition.
+type Leaders = BTreeMap<i32, Node>;
+/// The leaders of topics.
+type Topics = BTreeMap<String, Leaders>;
 
 /// An open connection to a cluster.
 pub(super) struct Brokers {
-    client: Client,
+    dialer: Dialer,
+    /// The connection by which topics are asked for, to any broker.
+    any: Mutex<Broker>,
 }
 
 impl Brokers {
+    /// Connects to the first broker of the address that can be reached.
     pub(super) async fn open(
         address: &Address,
         credentials: &Credentials<'_>,
         client_id: &str,
     ) -> Result<Self, PeerError> {
-        let first = (&address.host, &address.port);
-        let hosts = std::iter::once(first).chain(address.others.iter().map(|(host, port)| (host, port)));
-        let hosts = hosts.map(|(host, port)| format!("{}:{port}", bracketed(host)));
-        // The connection as a whole is opened again with growing pauses; here only changes of leaders are waited for.
-        let backoff = BackoffConfig {
-            init_backoff: Duration::from_millis(100),
-            max_backoff: Duration::from_millis(500),
-            base: 2.0,
-            deadline: Some(Duration::from_secs(1)),
-        };
-        let mut builder = ClientBuilder::new(hosts.collect())
-            .client_id(client_id)
-            .max_message_size(MAX_ANSWER_BYTES)
-            .backoff_config(backoff);
-        if address.scheme == Scheme::Kafkas {
-            builder = builder.tls_config(tls::peer_config(credentials)?);
+        let dialer = Dialer::new(address, credentials, client_id)?;
+        let first = (address.host.clone(), address.port);
+        let mut opened = dialer.open(&first).await;
+        for other in &address.others {
+            if opened.is_err() {
+                opened = dialer.open(other).await;
+            }
         }
-        if let Some(username) = credentials.username {
-            let password = credentials.secrets.get("password").unwrap_or_default();
-            let user = UserAndPassword::new(username.to_owned(), password.to_owned());
-            builder = builder.sasl_config(match credentials.sasl_mechanism {
-                None | Some(SaslMechanism::Plain) => SaslConfig::Plain(user),
-                Some(SaslMechanism::ScramSha256) => SaslConfig::ScramSha256(user),
-                Some(SaslMechanism::ScramSha512) => SaslConfig::ScramSha512(user),
-            });
+        let any = Mutex::new(opened?);
+        Ok(Self { dialer, any })
+    }
+
+    /// The leaders of topics, which are created if the cluster creates topics by itself.
+    async fn leaders(&self, topics: &[&str]) -> Result<Topics, PeerError> {
+        let mut tries = 0;
+        loop {
+            let (brokers, entries) = self.any.lock().await.ask(&Metadata { topics }).await?;
+            tries += 1;
+            match leaders_of(&brokers, entries) {
+                Ok(leaders) => return Ok(leaders),
+                Err((_, error)) if error.is_of_new_topic() && tries < NEW_TOPIC_TRIES => {
+                    tokio::time::sleep(NEW_TOPIC_PAUSE).await;
+                }
+                Err((topic, error)) => return Err(PeerError(format!("the topic {topic}: {error}"))),
+            }
         }
-        let client = within(OPEN_TIME, async { Ok(builder.build().await?) }).await?;
-        Ok(Self { client })
     }
 
-    async fn topics(&self) -> Result<Topics, PeerError> {
-        let topics = within(OPEN_TIME, async { Ok(self.client.list_topics().await?) }).await?;
-        Ok(topics.into_iter().map(|topic| (topic.name, topic.partitions.into_iter().collect())).collect())
-    }
-
-    /// The partitions of a topic, which is created if the cluster creates topics by itself.
-    async fn partitions(&self, topic: &str) -> Result<Vec<i32>, PeerError> {
-        if let Some(partitions) = self.topics().await?.remove(topic) {
-            return Ok(partitions);
-        }
-        // Asking for the leader of a partition has the cluster create the topic.
-        let created = within(OPEN_TIME, async { Ok(self.partition(topic, 0).await?) }).await;
-        let partitions = self.topics().await?.remove(topic);
-        partitions.ok_or_else(|| match created {
-            Err(error) => PeerError(format!("the topic {topic} does not exist: {error}")),
-            Ok(_) => PeerError(format!("the topic {topic} does not exist yet")),
-        })
-    }
-
-    async fn partition(&self, topic: &str, partition: i32) -> Result<PartitionClient, Error> {
-        self.client.partition_client(topic, partition, UnknownTopicHandling::Error).await
-    }
-
-    /// Completes when the brokers cannot be reached, or when a topic has no longer the partitions that are known.
+    /// Completes when the brokers cannot be reached, or when a topic has no longer the leaders that are known.
     async fn watch(&self, known: &Topics) -> PeerError {
+        let names: Vec<&str> = known.keys().map(String::as_str).collect();
         loop {
             tokio::time::sleep(LOOK_EVERY).await;
-            let topics = match self.topics().await {
-                Ok(topics) => topics,
+            match self.leaders(&names).await {
+                Ok(leaders) if leaders == *known => {}
+                Ok(_) => return "the partitions of topics, or their leaders, have changed".into(),
                 Err(error) => return error,
-            };
-            let changed = known.iter().find(|(name, partitions)| topics.get(*name) != Some(*partitions));
-            if let Some((name, _)) = changed {
-                return PeerError(format!("the partitions of the topic {name} have changed"));
             }
         }
     }
 }
 
-/// What a broker says of an error, if it was a broker's answer.
-const fn answer_of(error: &Error) -> Option<ProtocolError> {
-    match error {
-        Error::ServerError { protocol_error, .. } => Some(*protocol_error),
-        _ => None,
-    }
+/// The leaders of topics by a broker's answer, or the topic that has none with the reason.
+fn leaders_of(brokers: &[BrokerEntry], topics: Vec<TopicEntry>) -> Result<Topics, (String, ErrorCode)> {
+    let node = |leader: i32| {
+        let broker = brokers.iter().find(|broker| broker.id == leader);
+        let node = broker.and_then(|broker| Some((broker.host.clone(), broker.port.try_into().ok()?)));
+        node.ok_or(ErrorCode::LEADER_NOT_AVAILABLE)
+    };
+    let leaders = |topic: &TopicEntry| {
+        topic.error.check()?;
+        topic.leaders.iter().map(|(partition, leader)| Ok((*partition, node(*leader)?))).collect()
+    };
+    let known = |topic: TopicEntry| match leaders(&topic) {
+        Ok(leaders) => Ok((topic.name, leaders)),
+        Err(error) => Err((topic.name, error)),
+    };
+    topics.into_iter().map(known).collect()
 }

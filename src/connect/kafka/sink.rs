@@ -1,29 +1,30 @@
 //! A sink of Kafka.
 
+use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use futures_util::future::BoxFuture;
-use rskafka::chrono::DateTime;
-use rskafka::client::error::{Error, ProtocolError};
-use rskafka::client::partition::{Compression, PartitionClient};
-use rskafka::record::Record;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::{Brokers, MAX_PARTITIONS, Topics, answer_of};
+use super::batch::{NewRecord, encode};
+use super::broker::Broker;
+use super::requests::{ErrorCode, Produce};
+use super::{Brokers, Leaders, MAX_PARTITIONS, Node, Topics};
 use crate::connect::credentials::{Credentials, PeerError};
-use crate::connect::peer::{OPEN_TIME, within};
 use crate::connect::sink::{Outcomes, Sink};
 use crate::domain::OutboxMessage;
 use crate::exchange::Address;
+
+/// How long a broker waits for its replicas.
+const REPLICAS_WAIT_MS: i32 = 5_000;
 
 /// Writes messages with the key of their target, so that those of a target stay in order.
 pub(in crate::connect) struct KafkaSink {
     brokers: Arc<Brokers>,
     media_type: &'static str,
-    /// Numbers of partitions by topic.
-    topics: HashMap<String, Vec<i32>>,
-    partitions: HashMap<(String, i32), PartitionClient>,
+    topics: HashMap<String, Leaders>,
+    leaders: HashMap<Node, Broker>,
     /// Ends when the brokers cannot be reached.
     watching: AbortOnDropHandle<PeerError>,
 }
@@ -34,21 +35,9 @@ fn destination(message: &OutboxMessage) -> (&str, &str) {
 }
 
 /// The partition of a key, as the default of librdkafka's producers has it.
-fn partition_of(key: &str, partitions: &[i32]) -> Option<i32> {
+fn partition_of(key: &str, partitions: &Leaders) -> Option<i32> {
     let count = u32::try_from(partitions.len()).ok().filter(|count| *count > 0)?;
-    partitions.get((crc32fast::hash(key.as_bytes()) % count) as usize).copied()
-}
-
-/// Whether a broker will never take what it has refused.
-const fn is_refusal(answer: ProtocolError) -> bool {
-    matches!(
-        answer,
-        ProtocolError::MessageTooLarge
-            | ProtocolError::RecordListTooLarge
-            | ProtocolError::InvalidTopicException
-            | ProtocolError::InvalidTimestamp
-            | ProtocolError::InvalidRecord
-    )
+    partitions.keys().nth((crc32fast::hash(key.as_bytes()) % count) as usize).copied()
 }
 
 impl KafkaSink {
@@ -65,47 +54,58 @@ impl KafkaSink {
             brokers,
             media_type,
             topics: HashMap::new(),
-            partitions: HashMap::new(),
+            leaders: HashMap::new(),
             watching: AbortOnDropHandle::new(watching),
         })
     }
 
     /// The partition that a message belongs to.
     async fn route(&mut self, topic: &str, key: &str) -> Result<i32, PeerError> {
-        if self.topics.len() >= MAX_PARTITIONS || self.partitions.len() >= MAX_PARTITIONS {
+        if self.topics.len() >= MAX_PARTITIONS {
             self.topics.clear();
-            self.partitions.clear();
         }
         if !self.topics.contains_key(topic) {
-            let numbers = self.brokers.partitions(topic).await?;
-            self.topics.insert(topic.to_owned(), numbers);
+            self.topics.extend(self.brokers.leaders(&[topic]).await?);
         }
-        let numbers = self.topics.get(topic).map_or(&[][..], Vec::as_slice);
-        let partition = partition_of(key, numbers);
+        let partition = self.topics.get(topic).and_then(|leaders| partition_of(key, leaders));
         partition.ok_or_else(|| PeerError(format!("the topic {topic} has no partitions")))
     }
 
-    async fn write(&mut self, topic: &str, partition: i32, messages: &[&OutboxMessage]) -> Result<(), Error> {
-        let place = (topic.to_owned(), partition);
-        if !self.partitions.contains_key(&place) {
-            let client = self.brokers.partition(topic, partition).await?;
-            self.partitions.insert(place.clone(), client);
+    /// The connection to the leader of a partition.
+    async fn leader(&mut self, topic: &str, partition: i32) -> Result<&mut Broker, PeerError> {
+        let node = self.topics.get(topic).and_then(|leaders| leaders.get(&partition)).cloned();
+        let node = node.ok_or("the partition has no leader")?;
+        if self.leaders.len() >= MAX_PARTITIONS {
+            self.leaders.clear();
         }
-        let records = messages.iter().map(|message| self.record(message)).collect();
-        match self.partitions.get(&place) {
-            Some(client) => client.produce(records, Compression::NoCompression).await.map(drop),
-            None => Ok(()),
-        }
+        Ok(match self.leaders.entry(node) {
+            Entry::Occupied(known) => known.into_mut(),
+            Entry::Vacant(new) => {
+                let broker = self.brokers.dialer.open(new.key()).await?;
+                new.insert(broker)
+            }
+        })
     }
 
-    fn record(&self, message: &OutboxMessage) -> Record {
-        let headers = [("message-id", message.message_id.as_str()), ("content-type", self.media_type)];
-        Record {
-            key: Some(destination(message).1.as_bytes().to_vec()),
-            value: Some(message.payload.clone()),
-            headers: headers.map(|(name, value)| (name.to_owned(), value.as_bytes().to_vec())).into(),
-            timestamp: DateTime::from_timestamp_micros(message.created_at.as_microsecond())
-                .unwrap_or_default(),
+    async fn write(
+        &mut self,
+        topic: &str,
+        partition: i32,
+        messages: &[&OutboxMessage],
+    ) -> Result<Result<(), ErrorCode>, PeerError> {
+        let records: Vec<NewRecord<'_>> = messages.iter().map(|message| self.record(message)).collect();
+        let batch = encode(&records);
+        let request = Produce { topic, partition, batch: &batch, timeout_ms: REPLICAS_WAIT_MS };
+        let answer = self.leader(topic, partition).await?.ask(&request).await?;
+        answer.first().map(|error| error.check()).ok_or_else(|| "the broker answered nothing".into())
+    }
+
+    fn record<'a>(&self, message: &'a OutboxMessage) -> NewRecord<'a> {
+        NewRecord {
+            time_ms: message.created_at.as_millisecond(),
+            key: destination(message).1,
+            value: &message.payload,
+            headers: [("content-type", self.media_type), ("message-id", &message.message_id)],
         }
     }
 
@@ -119,10 +119,9 @@ impl KafkaSink {
     ) -> Result<(), PeerError> {
         let mut batches = vec![messages];
         while let Some(batch) = batches.pop() {
-            let written = async { Ok(self.write(topic, partition, batch).await) };
-            match within(OPEN_TIME, written).await? {
+            match self.write(topic, partition, batch).await? {
                 Ok(()) => outcomes.extend(batch.iter().map(|message| (message.number, Ok(())))),
-                Err(error) if !answer_of(&error).is_some_and(is_refusal) => return Err(error.into()),
+                Err(error) if !error.is_refusal() => return Err(error.into()),
                 Err(error) => match batch {
                     [message] => {
                         outcomes.push((message.number, Err(format!("the broker refuses it: {error}"))))
@@ -172,10 +171,10 @@ mod tests {
     /// Partitions that `kcat -P -k KEY -X partitioner=consistent` chose among four.
     #[test]
     fn keys_go_to_the_partitions_of_librdkafka() {
-        let partitions = [0, 1, 2, 3];
+        let partitions = (0..4).map(|partition| (partition, Node::default())).collect();
         for (key, expected) in [("gate/person-1", 1), ("gate/7", 2), ("gate/van", 3), ("yard/a", 3)] {
             assert_eq!(partition_of(key, &partitions), Some(expected), "{key}");
         }
-        assert_eq!(partition_of("any", &[]), None);
+        assert_eq!(partition_of("any", &Leaders::new()), None);
     }
 }

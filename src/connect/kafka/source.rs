@@ -1,15 +1,18 @@
 //! A source of topics of Kafka.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
-use rskafka::client::error::ProtocolError;
-use rskafka::client::partition::{OffsetAt, PartitionClient};
+use tokio::sync::Mutex;
 use tokio::task::JoinSet;
 
-use super::{Brokers, MAX_PARTITIONS, Topics, answer_of};
+use super::batch::Batch;
+use super::broker::Broker;
+use super::requests::{ErrorCode, Fetch, ListOffsets, OffsetAt};
+use super::{Brokers, MAX_PARTITIONS, Node, Topics};
 use crate::config::Limits;
 use crate::connect::credentials::PeerError;
 use crate::connect::inbox::{Inlet, Outlet, inbox};
@@ -18,33 +21,23 @@ use crate::connect::source::{Message, Settled, Source};
 use crate::domain::{ConnectionKey, Durability, SourceOffset};
 use crate::store::Store;
 
-/// Records that a broker sends at a time, bytes, over all partitions at most what a source may hold; a larger batch comes
-/// whole.
-const FETCH_BYTES: std::ops::RangeInclusive<usize> = 16 << 10..=256 << 10;
-/// What is kept of a message that is too large, for the status.
+/// Records that a broker sends at a time, bytes; a larger batch comes whole.
+const FETCH_BYTES: i32 = 1 << 20;
+/// Bytes of a message that is too large which are kept for the status.
 const KEPT_BYTES: usize = 4 << 10;
 /// How long a broker waits for records.
 const FETCH_WAIT: Duration = Duration::from_millis(500);
 
-/// A record of a topic, read from a partition.
+/// A record of a topic, read from a partition, or a batch that could not be read.
 struct PartitionRecord {
     /// Index into [`KafkaSource::partitions`].
     partition: usize,
     offset: i64,
     /// Its beginning alone where it is larger than is taken.
-    value: Vec<u8>,
+    value: Bytes,
     size_bytes: usize,
-}
-
-impl PartitionRecord {
-    fn new(partition: usize, offset: i64, mut value: Vec<u8>, most_bytes: usize) -> Self {
-        let size_bytes = value.len();
-        if size_bytes > most_bytes {
-            value.truncate(KEPT_BYTES);
-            value.shrink_to_fit();
-        }
-        Self { partition, offset, value, size_bytes }
-    }
+    /// Why it could not be read.
+    unread: Option<String>,
 }
 
 /// Opens sources of topics.
@@ -65,38 +58,19 @@ impl SourceReader {
             Some((store, key)) => store.source_offsets(*key).await?,
             None => Vec::new(),
         };
-        let Limits { connection_queue, connection_queue_bytes, .. } = self.limits;
-        let (records_in, records) = inbox(connection_queue, connection_queue_bytes);
-        let (mut known, mut partitions, mut readers) = (Topics::new(), Vec::new(), Vec::new());
-        for topic in topics {
-            let numbers = brokers.partitions(&topic).await?;
-            if partitions.len() + numbers.len() > MAX_PARTITIONS {
-                return Err(PeerError(format!("the topics have more than {MAX_PARTITIONS} partitions")));
-            }
-            for partition in numbers.clone() {
-                let opening = async { Ok(brokers.partition(&topic, partition).await?) };
-                let client = within(OPEN_TIME, opening).await?;
-                let next_offset = match first_offset(&stored, &topic, partition) {
-                    Ok(stored) => stored,
-                    Err(at) => within(OPEN_TIME, async { Ok(client.get_offset(at).await?) }).await?,
-                };
-                partitions.push(SourceOffset { topic: topic.clone(), partition, next_offset });
-                readers.push(client);
-            }
-            known.insert(topic, numbers);
-        }
+        let names: Vec<&str> = topics.iter().map(String::as_str).collect();
+        let known = brokers.leaders(&names).await?;
+        let (partitions, readers) = self.partitions(&brokers, &known, &stored).await?;
         // Before anything is read: what comes between a crash and the next start must be found.
         if let Some((store, key)) = &self.offsets {
             store.store_source_offsets(*key, &partitions, Durability::Synced).await?;
         }
-        let share = connection_queue_bytes / partitions.len().max(1);
-        let size = FetchSize {
-            fetch_bytes: share.clamp(*FETCH_BYTES.start(), *FETCH_BYTES.end()) as i32,
-            message_bytes: self.limits.connection_message_bytes,
-        };
-        let mut reading = JoinSet::new();
-        for (index, (client, from)) in readers.into_iter().zip(&partitions).enumerate() {
-            reading.spawn(read(client, index, from.next_offset, size, records_in.clone()));
+        let Limits { connection_queue, connection_queue_bytes, .. } = self.limits;
+        let (records_in, records) = inbox(connection_queue, connection_queue_bytes);
+        let (mut reading, turn) = (JoinSet::new(), Arc::new(Mutex::new(())));
+        for (broker, places) in readers {
+            let (records, turn, limits) = (records_in.clone(), turn.clone(), self.limits.clone());
+            reading.spawn(Reader { broker, places, records, turn, limits }.run());
         }
         reading.spawn(async move { brokers.watch(&known).await });
         Ok(KafkaSource {
@@ -107,6 +81,36 @@ impl SourceReader {
             last_receipt: 0,
             offsets: self.offsets,
         })
+    }
+
+    /// Where the reading of each partition begins, and who reads it: a connection to each leader with its partitions.
+    async fn partitions(
+        &self,
+        brokers: &Brokers,
+        known: &Topics,
+        stored: &[SourceOffset],
+    ) -> Result<(Vec<SourceOffset>, Vec<(Broker, Vec<Place>)>), PeerError> {
+        if known.values().map(|leaders| leaders.len()).sum::<usize>() > MAX_PARTITIONS {
+            return Err(PeerError(format!("the topics have more than {MAX_PARTITIONS} partitions")));
+        }
+        let mut partitions = Vec::new();
+        let mut readers: BTreeMap<&Node, (Broker, Vec<Place>)> = BTreeMap::new();
+        for (topic, leaders) in known {
+            for (partition, leader) in leaders {
+                if !readers.contains_key(leader) {
+                    readers.insert(leader, (brokers.dialer.open(leader).await?, Vec::new()));
+                }
+                let Some((broker, places)) = readers.get_mut(leader) else { continue };
+                let offset = match first_offset(stored, topic, *partition) {
+                    Ok(stored) => stored,
+                    Err(at) => offset_at(broker, topic, *partition, at).await?,
+                };
+                let (topic, partition) = (topic.clone(), *partition);
+                places.push(Place { index: partitions.len(), topic: topic.clone(), partition, offset });
+                partitions.push(SourceOffset { topic, partition, next_offset: offset });
+            }
+        }
+        Ok((partitions, readers.into_values().collect()))
     }
 }
 
@@ -121,72 +125,147 @@ fn first_offset(stored: &[SourceOffset], topic: &str, partition: i32) -> Result<
     }
 }
 
-/// How much is read at a time.
-#[derive(Clone, Copy)]
-struct FetchSize {
-    /// Bytes of one answer of a broker.
-    fetch_bytes: i32,
-    /// Bytes of a message that is taken.
-    message_bytes: usize,
+async fn offset_at(broker: &mut Broker, topic: &str, partition: i32, at: OffsetAt) -> Result<i64, PeerError> {
+    let answer = broker.ask(&ListOffsets { topic, partition, at }).await?;
+    let (error, offset) = answer.first().ok_or("the broker answered nothing")?;
+    error.check()?;
+    Ok(*offset)
 }
 
-/// Hands on the records of a partition; ends with the reason.
-async fn read(
-    client: PartitionClient,
-    partition: usize,
-    mut offset: i64,
-    size: FetchSize,
+/// How far a partition is read.
+struct Place {
+    /// Index into [`KafkaSource::partitions`].
+    index: usize,
+    topic: String,
+    partition: i32,
+    offset: i64,
+}
+
+/// Reads the partitions of one leader.
+struct Reader {
+    broker: Broker,
+    places: Vec<Place>,
     records: Inlet<PartitionRecord>,
-) -> PeerError {
-    let wait_ms = i32::try_from(FETCH_WAIT.as_millis()).unwrap_or(i32::MAX);
-    loop {
-        let fetching = client.fetch_records(offset, 1..size.fetch_bytes, wait_ms);
-        let fetched = match tokio::time::timeout(FETCH_WAIT + OPEN_TIME, fetching).await {
-            Ok(fetched) => fetched,
-            Err(_) => return "the broker does not answer".into(),
-        };
-        let (read, end) = match fetched {
-            Ok(fetched) => fetched,
-            Err(error) if answer_of(&error) == Some(ProtocolError::OffsetOutOfRange) => {
-                match oldest_offset(&client, offset).await {
-                    Ok(oldest) => offset = oldest,
-                    Err(error) => return error,
-                }
-                continue;
-            }
-            Err(error) => return error.into(),
-        };
-        if read.is_empty() && end > offset {
-            // The end of a transaction is sent at once and has no records.
-            tokio::time::sleep(FETCH_WAIT).await;
-        }
-        for it in read {
-            offset = it.offset + 1;
-            let value = it.record.value.unwrap_or_default();
-            let record = PartitionRecord::new(partition, it.offset, value, size.message_bytes);
-            let bytes = record.value.len();
-            if !records.put(record, bytes).await {
-                return "the source is closed".into();
-            }
-        }
-    }
+    /// Held while an answer is in memory: a source has one at a time, from however many brokers.
+    turn: Arc<Mutex<()>>,
+    limits: Limits,
 }
 
-/// Where a partition begins that has no longer, or not yet, the message at an offset.
-async fn oldest_offset(client: &PartitionClient, missing: i64) -> Result<i64, PeerError> {
-    let oldest = within(OPEN_TIME, async { Ok(client.get_offset(OffsetAt::Earliest).await?) }).await?;
-    if oldest == missing {
-        return Err(PeerError(format!("the broker has no message at its own oldest offset {oldest}")));
+impl Reader {
+    /// Hands on records; ends with the reason.
+    async fn run(mut self) -> PeerError {
+        loop {
+            if let Err(error) = self.read().await {
+                return error;
+            }
+            // The broker begins with the first, and another may have nothing for long.
+            self.places.rotate_left(1);
+        }
     }
-    let (topic, partition) = (client.topic(), client.partition());
-    tracing::warn!(
-        topic,
-        partition,
-        missing,
-        oldest,
-        "messages are gone; the oldest that is left comes next"
-    );
-    Ok(oldest)
+
+    /// Hands on the records of one answer.
+    async fn read(&mut self) -> Result<(), PeerError> {
+        let place = |it: &Place| (it.topic.clone(), it.partition, it.offset);
+        let request = Fetch {
+            places: self.places.iter().map(place).collect(),
+            max_wait_ms: FETCH_WAIT.as_millis() as i32,
+            max_bytes: FETCH_BYTES,
+        };
+        let broker = &mut self.broker;
+        let answering = async {
+            broker.send(&request).await?;
+            broker.answer_size().await
+        };
+        let size = within(FETCH_WAIT + OPEN_TIME, answering).await?;
+        let turn = self.turn.clone();
+        let _turn = turn.lock().await;
+        let (error, fetched) = within(OPEN_TIME, self.broker.answer::<Fetch>(size)).await?;
+        error.check()?;
+        for answer in fetched {
+            let place = |it: &Place| it.partition == answer.partition && it.topic == answer.topic;
+            let Some(place) = self.places.iter().position(place) else { continue };
+            if answer.error == ErrorCode::OFFSET_OUT_OF_RANGE {
+                self.begin_at_oldest(place).await?;
+            } else {
+                answer.error.check()?;
+                self.hand_on(place, answer.batches).await?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Goes on where a partition begins that has no longer, or not yet, the message at an offset.
+    async fn begin_at_oldest(&mut self, place: usize) -> Result<(), PeerError> {
+        let Place { topic, partition, offset: missing, .. } = &mut self.places[place];
+        let oldest = offset_at(&mut self.broker, topic, *partition, OffsetAt::Earliest).await?;
+        if oldest == *missing {
+            return Err(PeerError(format!("the broker has no message at its own oldest offset {oldest}")));
+        }
+        tracing::warn!(
+            topic,
+            partition,
+            missing,
+            oldest,
+            "the broker has deleted messages; reading continues with the oldest that it has"
+        );
+        *missing = oldest;
+        Ok(())
+    }
+
+    /// Hands on the records of a partition. A batch that cannot be read is handed on as such, and what comes after it is read.
+    async fn hand_on(&mut self, place: usize, mut sent: Bytes) -> Result<(), PeerError> {
+        let is_empty = sent.is_empty();
+        let mut batches = 0;
+        while let Some(batch) = Batch::next(&mut sent)? {
+            let last_offset = batch.last_offset;
+            if !batch.is_control() {
+                self.hand_on_batch(place, batch).await?;
+            }
+            self.places[place].offset = last_offset.saturating_add(1);
+            batches += 1;
+        }
+        if batches == 0 && !is_empty {
+            return Err("the broker sent a part of a batch alone".into());
+        }
+        Ok(())
+    }
+
+    async fn hand_on_batch(&mut self, place: usize, batch: Batch) -> Result<(), PeerError> {
+        let Place { index, topic, partition, offset: first } = &self.places[place];
+        let (last_offset, most_bytes) = (batch.last_offset, self.limits.connection_batch_bytes);
+        let unpacking = tokio::task::spawn_blocking(move || batch.records(most_bytes));
+        let unpacked = unpacking.await.map_err(|panic| PeerError(panic.to_string()))?;
+        let (records, unread) = match unpacked {
+            Ok(records) => (Some(records), None),
+            Err(reason) => (None, Some(Err(reason))),
+        };
+        for record in records.into_iter().flatten().chain(unread) {
+            let record = match record {
+                Ok((offset, _)) if offset < *first => continue,
+                Ok((offset, value)) => self.record(*index, offset, &value),
+                Err(reason) => PartitionRecord {
+                    partition: *index,
+                    offset: last_offset,
+                    value: format!("offsets up to {last_offset} of partition {partition} of {topic}").into(),
+                    size_bytes: 0,
+                    unread: Some(reason),
+                },
+            };
+            let bytes = record.value.len();
+            if !self.records.put(record, bytes).await {
+                return Err("the source is closed".into());
+            }
+        }
+        Ok(())
+    }
+
+    /// A record with a copy of its content, so that it does not keep its batch in memory.
+    fn record(&self, partition: usize, offset: i64, value: &[u8]) -> PartitionRecord {
+        let kept = if value.len() > self.limits.connection_message_bytes { KEPT_BYTES } else { value.len() };
+        let kept = &value[..kept.min(value.len())];
+        let (value, size_bytes) = (Bytes::copy_from_slice(kept), value.len());
+        PartitionRecord { partition, offset, value, size_bytes, unread: None }
+    }
 }
 
 /// Messages of topics.
@@ -215,8 +294,8 @@ impl Source for KafkaSource {
             self.last_receipt += 1;
             self.unsettled.insert(self.last_receipt, (record.partition, record.offset));
             let subject = self.partitions[record.partition].topic.clone();
-            let (payload, size_bytes) = (Bytes::from(record.value), record.size_bytes);
-            Ok(Message { receipt: self.last_receipt, subject, payload, size_bytes })
+            let PartitionRecord { value: payload, size_bytes, unread, .. } = record;
+            Ok(Message { receipt: self.last_receipt, subject, payload, size_bytes, unread })
         })
     }
 

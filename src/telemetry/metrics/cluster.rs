@@ -34,7 +34,7 @@ impl ClusterMetrics {
             ),
             history_breaks: registry.counter(
                 "sightfix_database_history_breaks_total",
-                "Times that the database went on from before what it had acknowledged, or may have, as after a fail-over",
+                "Times that the database continued from an earlier state than it had acknowledged, or may have, as after a fail-over",
                 &[],
             ),
         }

@@ -14,7 +14,7 @@ pub(super) struct QueueMetrics {
     pub(super) evaluation: [Gauge; 2],
 }
 
-/// What is counted and timed of one kind of background job.
+/// Counts and durations of one kind of background job.
 #[derive(Clone)]
 pub struct JobMetrics {
     succeeded: Counter,

@@ -25,7 +25,7 @@ pub(super) struct SiteMetrics {
     pub(super) events_lost: Counter,
 }
 
-/// What became of a box or fix that was handed to the tracker of a site.
+/// The outcome of a box or fix that was handed to the tracker of a site.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SiteItemOutcome {
     /// It went into the tracker.

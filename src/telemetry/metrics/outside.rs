@@ -3,7 +3,7 @@
 
 use std::fmt::Write as _;
 
-/// What one connection does on this node.
+/// The figures of one connection on this node.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutsideFigures {
     /// Its id: letters, digits and hyphens.
@@ -20,7 +20,7 @@ pub struct OutsideFigures {
     pub rejected: u64,
     /// Positions that were dropped, and messages that were dropped unread.
     pub dropped: u64,
-    /// What waits for its storage, or for its receiver.
+    /// Number of items that wait to be stored, or for their receiver.
     pub queued: u64,
     /// Messages that are not tried any more.
     pub dead_letters: u64,
@@ -39,7 +39,9 @@ const METRICS: [(&str, &str, &str, Value); 8] = [
         Some(own.rejected as f64)
     }),
     ("dropped_total", "counter", "Positions or messages that were dropped", |own| Some(own.dropped as f64)),
-    ("queued", "gauge", "What waits for its storage, or for its receiver", |own| Some(own.queued as f64)),
+    ("queued", "gauge", "Items that wait to be stored, or messages that wait for their receiver", |own| {
+        Some(own.queued as f64)
+    }),
     ("dead_letters", "gauge", "Messages that are not tried any more", |own| Some(own.dead_letters as f64)),
     ("lag_seconds", "gauge", "Age of the last item, or of the oldest waiting message", |own| own.lag_s),
 ];

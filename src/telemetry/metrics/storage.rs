@@ -1,4 +1,4 @@
-//! What is stored, and what is held of bounded resources.
+//! Metrics of stored rows and of bounded resources in use.
 
 use metrics::Gauge;
 
@@ -31,7 +31,7 @@ impl StorageMetrics {
             database_bytes: registry.gauge("sightfix_database_bytes", "Size of the database file", &[]),
             database_free_bytes: registry.gauge(
                 "sightfix_database_free_bytes",
-                "Of these, free for new rows",
+                "Bytes of the database that are free for new rows",
                 &[],
             ),
             disk_available_bytes: registry.gauge(

@@ -242,7 +242,7 @@ async fn a_sink_of_cameras_on_two_nodes_is_delivered_once() {
     taken.dedup();
     assert_eq!((taken.len(), receiver.taken().len()), (45, 45), "each once");
     assert_eq!(runner(&other, "hook").await, url(&other));
-    // What the other node had not queued cannot be known.
+    // Items that the other node had not queued cannot be known.
     connection_when(&other, "hook", |status| status["dropped"] == 1).await;
 }
 

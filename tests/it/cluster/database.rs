@@ -98,7 +98,7 @@ impl Database {
         SocketAddr::from(([127, 0, 0, 1], self.port))
     }
 
-    /// What a statement gives, once the server answers.
+    /// The output of a statement, once the server answers.
     pub(super) fn sql(&self, statement: &str) -> Result<String, String> {
         let output = Command::new("psql").args([&self.url(None), "-Atqc", statement]).output();
         let output = output.expect("psql runs");
@@ -215,7 +215,7 @@ fn binaries() -> PathBuf {
     versions.pop().expect("a version").join("bin")
 }
 
-/// What becomes of what is sent on a way.
+/// The treatment of bytes that are sent over a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum LinkState {
     /// It comes through, to this server.

@@ -20,7 +20,7 @@ const END_ALL_CONNECTIONS: &str = "SELECT count(pg_terminate_backend(pid)) FROM 
 const ITEMS: usize = 300;
 const RUNS: &str = "/v1/cameras/trained/training-runs";
 
-/// What happens to the database.
+/// A fault of the database.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum FaultKind {
     /// `kill -9` of the server, started again after a while.

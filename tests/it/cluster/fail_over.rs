@@ -1,4 +1,4 @@
-//! Databases that are out of reach, read-only, or go on from before what they have acknowledged.
+//! Databases that are out of reach, read-only, or continue from an earlier state than they have acknowledged.
 
 use std::process::Stdio;
 use std::time::Duration;

@@ -193,7 +193,7 @@ pub(super) fn number_of(name: &str, default: u64) -> u64 {
     std::env::var(name).map_or(default, |text| text.parse().expect("a number"))
 }
 
-/// What happens to the owner in the middle of a stream.
+/// A fault of the owner in the middle of a stream.
 #[derive(Debug, Clone, Copy)]
 enum FaultKind {
     Kill,

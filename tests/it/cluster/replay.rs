@@ -123,7 +123,7 @@ async fn a_thousand_cameras_lose_nothing_when_a_node_is_killed() {
     assert_eq!(acknowledged, cameras * items as u64, "{report}");
     assert_eq!((stored(folder.path()), sql(folder.path(), twice)), (acknowledged, "0".to_owned()));
     assert_eq!(report["given_up"], 0);
-    // What the killed node had is owned by others.
+    // Cameras of the killed node are owned by others.
     let others = "SELECT count(*) FROM camera_owners JOIN nodes ON nodes.id = node_id";
     assert_eq!(sql(folder.path(), others), count);
 }

@@ -1,4 +1,4 @@
-//! What must hold of a database after its server was killed.
+//! Invariants of a database after its server was killed.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -7,7 +7,7 @@ use rusqlite::{Connection, OptionalExtension as _};
 
 use super::load::{Load, ROWS, Streamer, Trainer, Work, Writer, active_model};
 
-/// What a check found to be wrong.
+/// The violations that a check has found.
 #[derive(Debug, Default)]
 pub(super) struct Findings {
     /// Acknowledged, and not there.
@@ -119,7 +119,7 @@ fn check_writer(database: &Connection, writer: &mut Writer, findings: &mut Findi
         return check_importer(database, writer, findings);
     }
     let name = &writer.name;
-    // What the state would be after a step, and the state that is found.
+    // The state expected after a step, and the state that is found.
     let (state_after, found): (fn(u64) -> u64, u64) = match writer.work {
         Work::Erase => {
             let stored: i64 = samples(database, name).values().sum();

@@ -12,7 +12,7 @@ use hyper_util::client::legacy::connect::HttpConnector;
 use hyper_util::rt::TokioExecutor;
 use serde_json::Value;
 
-/// What a client receives for a request.
+/// The response that a client receives for a request.
 pub(super) enum Reply {
     /// The server did it.
     Done(Value),

@@ -128,7 +128,7 @@ pub(super) async fn end(server: &mut TestServer, after: Duration) {
     server.kill_now();
 }
 
-/// What came of all moments.
+/// The sums over all moments.
 #[derive(Default)]
 struct Totals {
     moments: Vec<&'static str>,

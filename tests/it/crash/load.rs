@@ -28,7 +28,7 @@ pub(super) const ROWS: i64 = 3;
 /// Pause after a refusal, and between items of a stream.
 const PAUSE: Duration = Duration::from_millis(5);
 
-/// What a writer does, step by step.
+/// The steps of a writer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Work {
     /// Imports batches; when there is no space left, it deletes them and goes on.
@@ -127,7 +127,7 @@ impl Writer {
         }
     }
 
-    /// Whether the deletion was acknowledged or refused.
+    /// Returns true if the deletion was acknowledged or refused.
     async fn delete_batches(&mut self, client: &Client) -> bool {
         self.is_deleting = true;
         match delete_samples(client, &self.name).await {
@@ -216,7 +216,7 @@ impl Streamer {
     async fn run(&mut self, client: &Client) {
         self.streams += 1;
         self.acknowledged = (format!("stream-{}", self.streams), 0);
-        // What was stored before has been looked for; it would fill the database in the end.
+        // Samples stored before have been looked for; they would fill the database in the end.
         while matches!(delete_samples(client, "streamed").await, Reply::Refused(..)) {
             tokio::time::sleep(PAUSE).await;
         }

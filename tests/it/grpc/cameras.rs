@@ -18,6 +18,7 @@ fn yard() -> proto::CameraProfile {
         learn_automatically: Some(false),
         site: None,
         gnss_bias_sigma_m: Some(1.5),
+        location: Some(proto::Position { longitude_deg: Some(103.98678), latitude_deg: Some(30.6280135) }),
     }
 }
 
@@ -137,7 +138,7 @@ async fn bad_profiles_are_refused_by_the_path_of_the_field() {
         assert_eq!(fields, [field]);
         assert!(message.starts_with(field), "{message}");
     }
-    // What a client sent must not make the answer's headers too large for it.
+    // A client's text must not make the answer's headers too large for it.
     let mut profile = yard();
     profile.labels.insert(long, String::new());
     let create = proto::CreateCameraRequest { id: "yard".to_owned(), profile: Some(profile) };

@@ -1,10 +1,11 @@
-//! What a client of any gRPC server meets, and a server to meet it at.
+//! The behaviour of any gRPC server to its clients, and a server for these tests.
 
 use std::net::SocketAddr;
 use std::time::Duration;
 
 use futures_util::stream;
 use hyper::http::HeaderValue;
+use hyper::http::uri::Scheme;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use sightfix::app::App;
@@ -16,6 +17,7 @@ use sightfix::grpc::proto;
 use sightfix::grpc::proto::camera_service_client::CameraServiceClient;
 use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 use sightfix::grpc::proto::training_service_client::TrainingServiceClient;
+use sightfix::request::{RequestContext, RequestHead};
 use sightfix::shutdown::Shutdown;
 use sightfix::store::Store;
 use sightfix::telemetry::{Metrics, RequestId};
@@ -91,13 +93,21 @@ async fn channel(address: SocketAddr) -> Channel {
 async fn serve(listener: TcpListener, app: App, shutdown: Shutdown) {
     let router = grpc::router(&app, &shutdown).into_axum_router();
     loop {
-        let (stream, _) = listener.accept().await.expect("a connection");
-        let router = router.clone();
+        let (stream, address) = listener.accept().await.expect("a connection");
+        let (router, quotas) = (router.clone(), app.quotas.clone());
         tokio::spawn(async move {
             let service = service_fn(move |mut request| {
                 let id = RequestId::new(HeaderValue::from_static(REQUEST));
-                request.extensions_mut().insert(id.clone());
-                request.extensions_mut().insert(Caller::new(Principal::Everyone, None, None));
+                let head = RequestHead {
+                    id: id.clone(),
+                    is_grpc: true,
+                    class: grpc::class(request.uri().path()),
+                    scheme: Scheme::HTTP,
+                    address: address.ip(),
+                };
+                let context = RequestContext::new(head, quotas.clone());
+                context.authenticated(Caller::new(Principal::Everyone, None, None));
+                request.extensions_mut().insert(context);
                 let answer = router.clone().call(request);
                 async move { answer.await.map(|answer| grpc::explain(answer, &id)) }
             });

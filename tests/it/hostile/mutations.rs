@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::targets::{TARGETS, run};
 
-/// What parsers are known to stumble over.
+/// Inputs that break careless parsers.
 const TOKENS: [&[u8]; 34] = [
     b"NaN",
     b"inf",

@@ -15,7 +15,7 @@ const START_S: i64 = 1_704_067_200;
 /// Where the camera stands.
 const ORIGIN_DEG: [f64; 2] = [11.0, 48.0];
 
-/// What is simulated.
+/// The parameters of the simulation.
 #[derive(Clone, Copy)]
 pub(super) struct Crowd {
     pub(super) seed: u64,

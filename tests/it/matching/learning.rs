@@ -106,7 +106,7 @@ impl<'a> Square<'a> {
         self.server.get(&format!("/v1/cameras/{}/learning", self.camera)).await.expect(200).json()
     }
 
-    /// What the camera says once it has learnt, or has tried to.
+    /// Returns the camera's learning once it has succeeded or failed.
     async fn learnt(&self) -> Value {
         let mut learning = Value::Null;
         for _ in 0..3_000 {

@@ -160,7 +160,7 @@ async fn boxes_of_a_stream_are_matched_with_the_receivers_beside_them() {
     let rows = rows(&LIVE.recorded());
     let (first, last) = (rows[0].time, rows.last().expect("rows").time);
     let shift = now().duration_since(last);
-    let (before, behind): (Vec<&Row>, Vec<&Row>) =
+    let (before, after): (Vec<&Row>, Vec<&Row>) =
         rows.iter().partition(|row| row.time.duration_since(first).as_secs_f64() <= SENT_FIRST_S);
     for row in &before {
         sent(&mut client, item(row, shift)).await;
@@ -170,7 +170,7 @@ async fn boxes_of_a_stream_are_matched_with_the_receivers_beside_them() {
         wait_for_match(&mut client, latest, shift).await;
     }
     let mut answered = Answered::default();
-    for row in &behind {
+    for row in &after {
         answered.add(row, &sent(&mut client, item(row, shift)).await);
     }
     println!("{answered:?}");

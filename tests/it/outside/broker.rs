@@ -60,7 +60,7 @@ async fn a_broker_sends_again_what_was_not_stored_before_a_kill() {
     assert_eq!((&sample["class"], &sample["score"]), (&json!("person"), &json!(0.87890625)));
     server.kill();
 
-    // What was acknowledged does not come again.
+    // Acknowledged messages do not come again.
     let server = TestServer::start(folder.path());
     connection_when(&server, "frigate", |status| status["state"] == "running").await;
     broker.publish("frigate/events", "not JSON");
@@ -205,6 +205,67 @@ async fn an_encrypted_broker_is_used_only_if_its_certificate_is_trusted() {
     send_fix(&server, "van", &now().to_string(), 103.98678, false).await;
     let output = broker.received("sightfix/gate/van", 1);
     assert!(output.starts_with("sightfix/gate/van {"), "{output}");
+}
+
+/// The text that the broker keeps under a topic, once it is another one than before.
+fn retained(broker: &Broker, topic: &str, before: &str) -> String {
+    for _ in 0..300 {
+        let text = broker.retained(topic);
+        if text != before {
+            return text;
+        }
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    panic!("{topic} still has `{before}`")
+}
+
+#[tokio::test]
+#[ignore = "needs mosquitto"]
+async fn home_assistant_is_told_of_targets_and_whether_the_server_is_there() {
+    const AVAILABILITY: &str = "sightfix-availability/home";
+    let broker = Broker::start();
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let sink = json!({"id": "home", "sink": {
+        "address": format!("mqtt://127.0.0.1:{}", broker.port), "camera_ids": ["gate"], "min_interval_s": 0,
+        "format": "home_assistant",
+    }});
+    broker.subscribe("sightfix/#");
+    server.post("/v1/connections", &sink).await.expect(201);
+    connection_when(&server, "home", |status| status["state"] == "running").await;
+    assert_eq!(broker.retained(AVAILABILITY), "online");
+    send_fix(&server, "jane/phone", &now().to_string(), 103.98678, false).await;
+    let output = broker.received("sightfix/#", 1);
+    let (topic, payload) = output.trim_end().split_once(' ').expect("topic and payload");
+    let position: Value = serde_json::from_str(payload).expect("JSON");
+    assert_eq!(topic, "sightfix/gate/jane_phone");
+    assert!((position["longitude"].as_f64().expect("degrees") - 103.98678).abs() < 1e-6, "{position}");
+    assert!((position["latitude"].as_f64().expect("degrees") - 30.628).abs() < 1e-6, "{position}");
+    let accuracy_m = position["gps_accuracy"].as_f64().expect("m");
+    assert!(accuracy_m > 0.0 && accuracy_m < position["r95_m"].as_f64().expect("m"), "{position}");
+
+    // Home Assistant reads the configuration whenever it starts.
+    let configuration = broker.retained("homeassistant/device_tracker/sightfix_gate_jane_phone/config");
+    let configuration: Value = serde_json::from_str(&configuration).expect("JSON");
+    assert_eq!(configuration["json_attributes_topic"], topic);
+    assert_eq!(configuration["availability_topic"], AVAILABILITY);
+    assert_eq!(
+        (&configuration["name"], &configuration["source_type"]),
+        (&json!("jane/phone"), &json!("gps"))
+    );
+    assert!(configuration["unique_id"].is_string(), "{configuration}");
+
+    // Trying it neither announces the target of the trial nor ends the sink.
+    let tried = server.post("/v1/connections/home/test", &json!({})).await.expect(200).json();
+    assert_eq!(tried["message"]["reading"], json!(["delivered"]), "{tried}");
+    assert_eq!(broker.retained("homeassistant/device_tracker/sightfix_gate_sightfix-test/config"), "");
+    assert_eq!(broker.retained(AVAILABILITY), "online");
+    server.kill();
+    assert_eq!(retained(&broker, AVAILABILITY, "online"), "offline", "by the last will");
+    let server = TestServer::start(folder.path());
+    connection_when(&server, "home", |status| status["state"] == "running").await;
+    assert_eq!(retained(&broker, AVAILABILITY, "offline"), "online");
 }
 
 /// Reads a message of a subscription: its subject, headers and payload.

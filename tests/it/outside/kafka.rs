@@ -49,10 +49,16 @@ impl Cluster {
 
     /// Has kcat write a message to a partition.
     fn publish(&self, partition: u32, message: &str) {
+        self.publish_compressed(partition, "none", message.as_bytes());
+    }
+
+    /// Has kcat write a message of one line to a partition, compressed by a codec.
+    fn publish_compressed(&self, partition: u32, codec: &str, message: &[u8]) {
         let mut command = Command::new("kcat");
-        command.args(["-b", &self.address, "-P", "-t", TOPIC, "-p", &partition.to_string()]);
+        command.args(["-b", &self.address, "-P", "-t", TOPIC, "-p", &partition.to_string(), "-z", codec]);
+        command.args(["-X", "message.max.bytes=1000000000"]);
         let mut process = command.stdin(Stdio::piped()).spawn().expect("kcat is installed");
-        process.stdin.take().expect("piped").write_all(message.as_bytes()).expect("it reads");
+        process.stdin.take().expect("piped").write_all(message).expect("it reads");
         assert!(process.wait().expect("it ends").success());
     }
 
@@ -131,7 +137,7 @@ async fn a_broker_of_kafka_is_read_on_behind_what_is_stored_also_after_a_kill() 
     assert_eq!((&sample["target_id"], &sample["class"]), (&json!("345"), &json!("Bicycle")));
     server.kill();
 
-    // What was acknowledged does not come again, and what came meanwhile does.
+    // Acknowledged messages do not come again, and those that came meanwhile do.
     let time = now();
     cluster.publish(0, &detection(time, "7"));
     cluster.publish(2, &detection(time, "8"));
@@ -171,6 +177,40 @@ async fn a_broker_of_kafka_may_go_and_a_topic_may_begin_again() {
     patch(&server, "detector", &address).await.expect(200);
     let status = connection_when(&server, "detector", |status| status["acknowledged"] == 4).await;
     assert_eq!(status["status"]["items"], 4, "{status}");
+}
+
+#[tokio::test]
+#[ignore = "needs kcat"]
+async fn a_batch_that_becomes_too_large_is_rejected_and_what_comes_after_it_is_read() {
+    let cluster = Cluster::start();
+    let folder = data_folder();
+    let server =
+        TestServer::start_with(folder.path(), &[("SIGHTFIX_LIMITS__CONNECTION_BATCH_BYTES", "3000000")]);
+    create_gate(&server).await;
+    let mut draft = source(&cluster);
+    draft["source"]["store_samples"] = json!(false);
+    server.post("/v1/connections", &draft).await.expect(201);
+    connection_when(&server, "detector", |status| status["state"] == "running").await;
+    let codecs = ["gzip", "snappy", "lz4", "zstd"];
+    for (index, codec) in codecs.into_iter().enumerate() {
+        cluster.publish_compressed(0, codec, &[b'0'; 4_000_000]);
+        cluster.publish_compressed(0, codec, detection(now(), &index.to_string()).as_bytes());
+    }
+    let status = connection_when(&server, "detector", |status| status["acknowledged"] == 8).await;
+    let status = &status["status"];
+    assert_eq!((&status["items"], &status["rejected"]), (&json!(4), &json!(4)), "{status}");
+    assert_eq!(status["connects"], 1, "{status}");
+    let reason = &status["reasons"][0];
+    let expected = "rejected: the batch becomes more than 3000000 bytes when decompressed";
+    assert_eq!((&reason["reason"], &reason["count"]), (&json!(expected), &json!(4)), "{status}");
+    let example = reason["example"].as_str().expect("a text");
+    assert!(example.contains("of partition 0 of detections"), "{example}");
+
+    // One message that is too large for a message, in a batch that is not too large.
+    cluster.publish_compressed(0, "zstd", &[b'0'; 2_000_000]);
+    let status = connection_when(&server, "detector", |status| status["acknowledged"] == 9).await;
+    let reasons = status["status"]["reasons"].to_string();
+    assert!(reasons.contains("is larger than 1048576 bytes"), "{reasons}");
 }
 
 #[tokio::test]

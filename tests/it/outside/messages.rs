@@ -34,7 +34,7 @@ fn fixes(reading: &Reading) -> Vec<(Option<&str>, f64, f64, String)> {
     fixes
 }
 
-/// Of Frigate's documentation, docs/docs/integrations/mqtt.md.
+/// The example in Frigate's documentation, docs/docs/integrations/mqtt.md.
 const FRIGATE: &str = r#"{"type": "update",
     "before": {"id": "1607123955.475377-mxklsc", "camera": "front_door", "frame_time": 1607123961.837752,
         "label": "person", "top_score": 0.958984375, "false_positive": false, "score": 0.7890625,

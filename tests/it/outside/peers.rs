@@ -89,6 +89,15 @@ impl Broker {
         assert!(process.wait().expect("it ends").success());
     }
 
+    /// The retained message of a topic; empty if there is none.
+    pub(crate) fn retained(&self, topic: &str) -> String {
+        let mut command = Command::new("mosquitto_sub");
+        command.args(&self.client_arguments);
+        command.args(["-p", &self.port.to_string(), "-t", topic, "-C", "1", "-W", "1", "--retained-only"]);
+        let output = command.output().expect("mosquitto-clients is installed");
+        String::from_utf8(output.stdout).expect("text").trim_end().to_owned()
+    }
+
     fn subscriber(&self, topic: &str) -> Command {
         let mut command = Command::new("mosquitto_sub");
         command.args(&self.client_arguments);

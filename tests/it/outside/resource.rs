@@ -108,6 +108,10 @@ async fn settings_that_cannot_work_are_refused_with_their_field() {
         (sink(json!({"address": "mqtt://b", "camera_ids": ["gate"], "topic": "a/#"})), "sink.topic"),
         (sink(json!({"address": "nats://b", "camera_ids": ["gate"], "topic": "a.>"})), "sink.topic"),
         (
+            sink(json!({"address": "http://h", "camera_ids": ["gate"], "format": "home_assistant"})),
+            "sink.format",
+        ),
+        (
             sink(json!({"address": "http://h", "camera_ids": ["gate"], "min_interval_s": -1})),
             "sink.min_interval_s",
         ),

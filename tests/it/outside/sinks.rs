@@ -27,6 +27,11 @@ struct Hook {
 impl Hook {
     /// Reads a request and answers with a status.
     async fn answered(stream: &mut BufReader<TcpStream>, status: u16) -> Self {
+        Self::answered_with(stream, status, "").await
+    }
+
+    /// The same with further headers, each with the end of its line.
+    async fn answered_with(stream: &mut BufReader<TcpStream>, status: u16, headers_out: &str) -> Self {
         let mut headers = Vec::new();
         loop {
             let mut line = String::new();
@@ -40,7 +45,7 @@ impl Hook {
         let mut hook = Self { headers, body: Vec::new() };
         hook.body = vec![0; hook.header("content-length").parse().expect("a number")];
         stream.read_exact(&mut hook.body).await.expect("a body");
-        let answer = format!("HTTP/1.1 {status} Status\r\ncontent-length: 0\r\n\r\n");
+        let answer = format!("HTTP/1.1 {status} Status\r\n{headers_out}content-length: 0\r\n\r\n");
         stream.get_mut().write_all(answer.as_bytes()).await.expect("an answer");
         hook
     }
@@ -148,6 +153,31 @@ async fn a_webhook_is_signed_and_comes_again_until_it_is_taken_also_after_a_kill
     assert!(second["time"].as_str() > first["time"].as_str() && second["id"] != first["id"]);
     connection_when(&server, "hook", |status| status["queued"] == 0).await;
     assert!(server.log_lines(&key).is_empty());
+}
+
+#[tokio::test]
+async fn a_receiver_that_names_a_pause_is_left_alone_until_it_ends() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let draft = json!({"id": "hook", "sink": {
+        "address": format!("http://{address}/hook?site=1"), "camera_ids": ["gate"], "min_interval_s": 0,
+    }});
+    server.post("/v1/connections", &draft).await.expect(201);
+    let mut stream = accept(&listener).await;
+    send_fixes(&server, "van", 1).await;
+    Hook::answered_with(&mut stream, 429, "retry-after: 300\r\n").await;
+    connection_when(&server, "hook", |status| status["state"] == "waiting").await;
+    // Without a pause the next attempt comes after a tenth of a second.
+    let early = tokio::time::timeout(std::time::Duration::from_secs(2), listener.accept()).await;
+    assert!(early.is_err(), "the receiver asked for five minutes");
+    // An operator need not wait.
+    patch(&server, "hook", &json!({"paused": true})).await.expect(200);
+    patch(&server, "hook", &json!({"paused": false})).await.expect(200);
+    Hook::answered(&mut accept(&listener).await, 200).await;
+    connection_when(&server, "hook", |status| status["queued"] == 0).await;
 }
 
 #[tokio::test]

@@ -32,7 +32,7 @@ pub(super) struct Script {
     pub(super) refuse: Option<Status>,
 }
 
-/// What the server has received.
+/// The items that the server has received.
 #[derive(Debug, Default)]
 pub(super) struct Received {
     pub(super) openings: Vec<proto::StreamOpening>,

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use jiff::SignedDuration;
 use sightfix::domain::{CameraId, TimeBounds};
-use sightfix::exchange::{Format, RowRules, read_observations};
+use sightfix::exchange::{Format, RowRules, read_live_items};
 use sightfix::replay::{Counters, FaultShares, Pace, RecordedStream, ReplayOptions, ReplayReport, replay};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
@@ -25,7 +25,7 @@ fn recording(rows: i64) -> RecordedStream {
     }
     let bounds = TimeBounds::at("2027-01-01T00:00:00Z".parse().expect("a time"));
     let rules = RowRules { time_bounds: bounds, image_size: None };
-    let rows = read_observations(csv.as_bytes(), Format::Csv, &rules).expect("a header");
+    let rows = read_live_items(csv.as_bytes(), Format::Csv, &rules).expect("a header");
     RecordedStream::from_rows(rows.map(|row| row.expect("a file").expect("a row"))).expect("rows")
 }
 

@@ -150,7 +150,7 @@ impl Crossing {
         EastNorth { east_m: 10.5 + walked_m - 2.0 * walker as f64, north_m: 3.0 * walker as f64 - 3.0 }
     }
 
-    /// What a camera sees. Both trackers count from 1, in opposite orders: their ids have nothing in common.
+    /// The detections of a camera. Both trackers count from 1, in opposite orders: their ids have nothing in common.
     pub(super) fn seen(&self, camera: usize, frame: usize, noise: &mut Noise) -> Vec<Seen> {
         let seen = |walker: usize| {
             let number = if camera == 0 { walker + 1 } else { self.walkers - walker };

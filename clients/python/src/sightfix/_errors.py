@@ -9,7 +9,7 @@ from sightfix.models import Evaluation, SiteTrainingRun, TrainingRun, Violation
 TYPE_PREFIX = "urn:sightfix:problem:"
 
 Job = TrainingRun | SiteTrainingRun | Evaluation
-"""What the server works on in the background."""
+"""A background job of the server."""
 
 
 class SightfixError(Exception):
@@ -38,7 +38,7 @@ class StreamClosedError(SightfixError):
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """What the server says of a failure (RFC 9457), over REST and over gRPC alike."""
+    """The server's description of a failure (RFC 9457), over REST and over gRPC alike."""
 
     status: int
     """HTTP status; 0 if it came over gRPC."""

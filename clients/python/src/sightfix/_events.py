@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sightfix._json import from_json
-from sightfix.models import CameraMoved, LostSiteEventCount, TrackChange, TrackUpdate, WorldTrackFeature
+from sightfix.models import CameraMoved, LostSiteEventCount, SeenBox, TrackChange, TrackUpdate, WorldTrackFeature
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class LostEvents:
 
 @dataclass(frozen=True)
 class SiteEvent:
-    """What happened at a site."""
+    """An event of a site."""
 
     id: str
     """Its id; a watch can resume after it."""
@@ -27,7 +27,7 @@ class SiteEvent:
     """A position (`track`), lost events (`lost`), or a change of tracks."""
 
 
-CameraEvent = TrackUpdate | CameraMoved | LostEvents
+CameraEvent = TrackUpdate | SeenBox | CameraMoved | LostEvents
 
 
 class ServerSentEventParser:
@@ -75,6 +75,8 @@ def camera_event(name: str, value: Any) -> CameraEvent | None:
     match name:
         case "track":
             return from_json(TrackUpdate, value)
+        case "box":
+            return from_json(SeenBox, value)
         case "camera_moved":
             return from_json(CameraMoved, value)
         case "lost":

@@ -20,9 +20,9 @@ class LiveItem:
     """Number that the camera's tracker gave a box whose target is not known; instead of `target_id`. The answer's
     `receiver_match` says which receiver the target carries, as soon as that is sure."""
     bounding_box: BoundingBox | None = None
-    """What the camera saw."""
+    """The box that the detector gives."""
     fix: Fix | None = None
-    """What the receiver said."""
+    """The fix of the receiver."""
     class_: str | None = None
     """The detector's class."""
     score: float | None = None

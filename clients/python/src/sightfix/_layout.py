@@ -16,7 +16,7 @@ class CsvLayout:
     columns: Literal["auto"] | Mapping[str, str] | None = None
     """`auto` finds columns by usual names; a mapping names them by field, such as `{"left": "x1"}`."""
     box_form: BoxForm | None = None
-    """What the columns of a box hold; by their names if left out."""
+    """The meaning of the columns of a box; by their names if left out."""
     box_unit: BoxUnit | None = None
     """Unit of the sides; pixels if left out."""
 

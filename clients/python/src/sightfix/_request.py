@@ -30,7 +30,7 @@ class Request:
     files: Mapping[str, Path] = field(default_factory=dict)
     """Files of a multipart body by the names of their parts."""
     is_idempotent: bool = False
-    """Whether sending it twice has the effect of sending it once."""
+    """True if sending it twice has the effect of sending it once."""
 
 
 def path(*segments: str | int) -> str:
@@ -111,7 +111,7 @@ class RetryPolicy:
     """Uniform numbers in [0, 1)."""
 
     def delay_s(self, failures: int, retry_after_s: float | None = None) -> float:
-        """The delay after so many failures in succession: exponential with jitter, or what the server asks for."""
+        """The delay after a number of failures in succession: exponential with jitter, or what the server asks for."""
         doubled = min(self.initial_delay_s * 2.0 ** min(failures - 1, 16), self.max_delay_s)
         jittered = doubled * (0.5 + 0.5 * self.draw())
         return jittered if retry_after_s is None else min(max(retry_after_s, jittered), self.max_delay_s)
@@ -130,7 +130,7 @@ def problem_of(response: httpx.Response) -> ProblemError:
 
 
 def may_send_again(request: Request, status: int, problem: ProblemError) -> bool:
-    """Whether a refused request may be sent again."""
+    """True if a refused request may be sent again."""
     refused = ("overloaded", "camera-between-nodes", "camera-on-other-node")
     refused_before_work = problem.kind in refused or status == httpx.codes.TOO_MANY_REQUESTS
     retryable = (
@@ -143,12 +143,12 @@ def may_send_again(request: Request, status: int, problem: ProblemError) -> bool
 
 
 def was_not_sent(error: httpx.TransportError) -> bool:
-    """Whether a request failed before any of it was sent."""
+    """True if a request failed before any of it was sent."""
     return isinstance(error, httpx.ConnectError | httpx.ConnectTimeout | httpx.PoolTimeout)
 
 
 def retry_after_s(response: httpx.Response, now: datetime | None = None) -> float | None:
-    """What the header `Retry-After` asks for: seconds or an HTTP date."""
+    """The pause that the header `Retry-After` asks for, in seconds or as an HTTP date."""
     text = response.headers.get("retry-after")
     if text is None:
         return None

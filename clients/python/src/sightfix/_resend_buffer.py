@@ -13,9 +13,9 @@ class BufferedItem(Generic[T]):
 
     item: T
     is_awaited: bool = False
-    """Whether it was sent on the current stream and its answer is still to come."""
+    """True if it was sent on the current stream and its answer is still to come."""
     is_answered: bool = False
-    """Whether its answer arrived or was dropped, on this or an earlier stream."""
+    """True if its answer arrived or was dropped, on this or an earlier stream."""
 
 
 class ResendBuffer(Generic[T]):
@@ -56,7 +56,7 @@ class ResendBuffer(Generic[T]):
         return self.last_seq
 
     def has_next(self) -> bool:
-        """Whether an item is to be sent on this stream."""
+        """True if an item is to be sent on this stream."""
         # Without acknowledgements an answered item need not be sent again.
         while not self._must_acknowledge and self._sent < len(self._items) and self._items[self._sent].is_answered:
             self._sent += 1

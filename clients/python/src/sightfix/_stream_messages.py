@@ -68,7 +68,7 @@ RETRYABLE_WITHOUT_DETAILS = ("UNKNOWN", "CANCELLED", "RESOURCE_EXHAUSTED")
 
 
 def stream_failure(error: grpc.RpcError) -> StreamFailure:
-    """What the status of a stream that ended means."""
+    """The meaning of the status of a stream that ended."""
     # Every error of a call has its status, which the type does not show.
     call: Any = error
     code = call.code().name

@@ -65,7 +65,7 @@ def column_values(column: Any) -> list[Any]:
 
 
 def is_missing(value: Any) -> bool:
-    """Whether a value is None, NaN, NaT, NA or an empty text."""
+    """True if a value is None, NaN, NaT, NA or an empty text."""
     if value is None or value == "":
         return True
     # The NA of pandas has no truth value; NaN and NaT differ from themselves.

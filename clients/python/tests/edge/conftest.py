@@ -44,7 +44,7 @@ class EdgeProcess:
 
     @property
     def log(self) -> str:
-        """What it has printed."""
+        """The printed text."""
         return self._log.read_text()
 
     def wait_for(self, text: str, count: int = 1) -> None:

@@ -29,7 +29,7 @@ WIDTH_PX, HEIGHT_PX = 1280, 720
 NOISE_SIGMA = 2.5
 SHADOW_FACTOR = 0.6
 VEHICLE_WIDTH = 2.8
-"""Of a vehicle as `vehicle` draws it, in heights."""
+"""Width of a vehicle as `vehicle` draws it, in heights."""
 STANDING_PX = 3.0
 """Who moves by less in a second stands."""
 

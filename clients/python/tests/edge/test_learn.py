@@ -32,7 +32,7 @@ class TruePlaces:
         self._places = {row.time: np.array(row.truth_deg) for row in rows}
 
     def distance_m(self, time: datetime, longitude_deg: float, latitude_deg: float) -> float | None:
-        """Of a position from the truth; None while nobody was in view."""
+        """Distance of a position from the truth; None while nobody was in view."""
         whole = time.replace(microsecond=0)
         first, second = self._places.get(whole), self._places.get(whole + timedelta(seconds=1))
         if first is None or second is None:
@@ -46,7 +46,7 @@ class TruePlaces:
 def mean_error_m(
     client: Client, camera_id: str, boxes: Iterable[tuple[datetime, BoundingBox]], rows: list[Row]
 ) -> float:
-    """Of the positions of boxes alone."""
+    """Mean error of the positions of boxes alone."""
     observations = [Observation(time=time, bounding_box=box) for time, box in boxes]
     truth, errors = TruePlaces(rows), []
     for observation, fused in zip(observations, client.fusions.fuse_batch(camera_id, observations), strict=True):
@@ -58,7 +58,7 @@ def mean_error_m(
 
 
 def true_boxes(video: Video) -> Iterator[tuple[datetime, BoundingBox]]:
-    """What the frames show."""
+    """The boxes that the frames show."""
     for time, boxes in zip(video.times, video.boxes, strict=True):
         for box in boxes:
             left, top, right, bottom = box.sides_px
@@ -66,7 +66,7 @@ def true_boxes(video: Video) -> Iterator[tuple[datetime, BoundingBox]]:
 
 
 def recorded_boxes(file: Path) -> Iterator[tuple[datetime, BoundingBox]]:
-    """What was recorded."""
+    """The boxes that were recorded."""
     with file.open(newline="") as opened:
         for row in csv.DictReader(opened):
             left, top, width, height = (float(row[name]) for name in ("left", "top", "width", "height"))

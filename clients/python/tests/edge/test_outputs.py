@@ -1,4 +1,4 @@
-"""What becomes of boxes and stills."""
+"""The outputs of boxes and stills."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ use uuid::Uuid;
 use super::error::{Error, ErrorKind, Result};
 use super::names::{CameraId, check_text};
 
-/// What a key is for. `app::access` says which operations each role may use.
+/// The purpose of a key. `app::access` says which operations each role may use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Display, EnumString, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_role)]
 pub enum Role {
@@ -79,7 +79,7 @@ impl Scope {
         &self.cameras
     }
 
-    /// Whether the scope contains a camera.
+    /// True if the scope contains a camera.
     #[must_use]
     pub fn contains(&self, camera: &CameraId) -> bool {
         self.role != Role::Edge || self.cameras.binary_search(camera).is_ok()
@@ -153,7 +153,7 @@ impl KeySecret {
         &self.0
     }
 
-    /// What is stored of it.
+    /// Returns the digest that is stored of the secret.
     #[must_use]
     pub fn digest(&self) -> SecretDigest {
         SecretDigest::of(self.0.as_bytes())
@@ -217,9 +217,9 @@ impl PartialEq for SecretDigest {
 /// A key to be created.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewKey {
-    /// What it is for, for people.
+    /// The key's purpose, for people.
     pub name: String,
-    /// What it may do.
+    /// The cameras and sites that the key may use.
     pub scope: Scope,
     /// When it stops working, if it does.
     pub expires_at: Option<Timestamp>,
@@ -242,9 +242,9 @@ impl NewKey {
 pub struct ApiKey {
     /// Its id.
     pub id: KeyId,
-    /// What it is for, for people.
+    /// The key's purpose, for people.
     pub name: String,
-    /// What it may do.
+    /// The cameras and sites that the key may use.
     pub scope: Scope,
     /// Time of creation.
     pub created_at: Timestamp,
@@ -257,7 +257,7 @@ pub struct ApiKey {
 }
 
 impl ApiKey {
-    /// Whether it works at a time.
+    /// True if the key works at a time.
     #[must_use]
     pub fn is_valid_at(&self, now: Timestamp) -> bool {
         self.revoked_at.is_none() && self.expires_at.is_none_or(|expires_at| now < expires_at)

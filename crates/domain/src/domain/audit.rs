@@ -32,14 +32,14 @@ impl Actor {
         Self { name: name.into(), key_id: None, identity: None, address: None, request_id: None }
     }
 
-    /// Whether a client asked, rather than the program by itself.
+    /// True if a client asked, rather than the program by itself.
     #[must_use]
     pub const fn is_client(&self) -> bool {
         self.key_id.is_some() || self.address.is_some()
     }
 }
 
-/// What was changed.
+/// A kind of change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, EnumString, IntoStaticStr)]
 #[strum(serialize_all = "kebab-case", parse_err_ty = Error, parse_err_fn = unknown_action)]
 pub enum AuditAction {
@@ -120,16 +120,16 @@ pub struct AuditNumber(pub u64);
 /// An entry of the audit log.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AuditEntry {
-    /// Its number.
+    /// The number of the entry.
     pub number: AuditNumber,
     /// Time of the change.
     pub time: Timestamp,
     /// Who changed it, and from where.
     pub actor: Actor,
-    /// What was done.
+    /// The kind of change.
     pub action: AuditAction,
     /// The camera that it was done to or for; it may have been deleted since.
     pub camera_id: Option<CameraId>,
-    /// What exactly: id of a run, number of a model version, name and role of a key.
+    /// The object of the change: id of a run, number of a model version, name and role of a key.
     pub subject: Option<String>,
 }

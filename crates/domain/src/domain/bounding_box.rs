@@ -3,7 +3,7 @@
 use super::error::{Error, Result};
 
 /// Larger images are refused; within this f32 resolves pixels to 1/64.
-const MAX_IMAGE_PX: u32 = 131_072;
+pub(super) const MAX_IMAGE_PX: u32 = 131_072;
 
 /// Size of a camera's image in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -144,7 +144,7 @@ impl BoundingBox {
         [self.left_px + 0.5 * self.width_px, self.top_px + self.height_px]
     }
 
-    /// Whether the image border truncates the box, to within one pixel. Without an image size only the
+    /// True if the image border truncates the box, to within one pixel. Without an image size only the
     /// upper and left borders are checked.
     #[must_use]
     pub fn touches_border(self, image_size: Option<ImageSize>) -> bool {

@@ -11,6 +11,7 @@ use super::names::{CameraId, SiteId, TargetClass, check_labels, check_text};
 use super::receiver::Receivers;
 use super::recipe::Recipe;
 use super::sample::SampleCount;
+use crate::geo::Position;
 
 /// Revision number of a profile, from 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -27,6 +28,8 @@ pub struct NewCamera {
     pub image_size: Option<ImageSize>,
     /// The receiver's error.
     pub gnss_error: GnssError,
+    /// Rough position of the camera itself. Imported fixes are compared with it.
+    pub location: Option<Position>,
     /// The bias that all fixes have in common; `None` for the model's own prior.
     pub gnss_bias_sigma: Option<GnssBiasSigma>,
     /// Recipe of training runs.
@@ -37,10 +40,10 @@ pub struct NewCamera {
     pub labels: BTreeMap<String, String>,
     /// The targets that carry the GNSS receivers, and the receivers' clock offsets.
     pub receivers: Receivers,
-    /// Whether a training run starts automatically after the camera has moved.
+    /// True if a training run starts automatically after the camera has moved.
     pub retrain_when_moved: bool,
-    /// Whether the camera, while it has no model, records boxes of trackers and fixes of receivers and is trained on those
-    /// that belong together beyond doubt.
+    /// True if the camera, while it has no model, records boxes of trackers and fixes of receivers and is trained on
+    /// those that certainly belong together.
     pub learn_automatically: bool,
     /// The site whose tracks the camera contributes to.
     pub site: Option<SiteId>,
@@ -55,6 +58,7 @@ impl NewCamera {
             id,
             image_size: None,
             gnss_error: GnssError::default(),
+            location: None,
             gnss_bias_sigma: None,
             recipe: Recipe::default(),
             target_classes: Vec::new(),
@@ -117,6 +121,8 @@ pub struct CameraChange {
     pub image_size: Option<Option<ImageSize>>,
     /// New receiver error.
     pub gnss_error: Option<GnssError>,
+    /// New position of the camera itself; `Some(None)` removes it.
+    pub location: Option<Option<Position>>,
     /// New common bias of all fixes; `Some(None)` removes it.
     pub gnss_bias_sigma: Option<Option<GnssBiasSigma>>,
     /// New recipe, for future runs.
@@ -127,9 +133,9 @@ pub struct CameraChange {
     pub labels: Option<BTreeMap<String, String>>,
     /// New receivers; they replace all.
     pub receivers: Option<Receivers>,
-    /// Whether to retrain automatically.
+    /// The new value of [`NewCamera::retrain_when_moved`].
     pub retrain_when_moved: Option<bool>,
-    /// Whether to learn automatically while there is no model.
+    /// The new value of [`NewCamera::learn_automatically`].
     pub learn_automatically: Option<bool>,
     /// New site; `Some(None)` removes the camera from its site.
     pub site: Option<Option<SiteId>>,
@@ -137,10 +143,11 @@ pub struct CameraChange {
 
 impl CameraChange {
     /// Names of the fields that can be changed, on both transports.
-    pub const FIELDS: [&str; 11] = [
+    pub const FIELDS: [&str; 12] = [
         "display_name",
         "image_size",
         "gnss_error",
+        "location",
         "gnss_bias_sigma_m",
         "recipe",
         "target_classes",
@@ -158,6 +165,7 @@ impl CameraChange {
             display_name: is_named("display_name").then_some(profile.display_name),
             image_size: is_named("image_size").then_some(profile.image_size),
             gnss_error: is_named("gnss_error").then_some(profile.gnss_error),
+            location: is_named("location").then_some(profile.location),
             gnss_bias_sigma: is_named("gnss_bias_sigma_m").then_some(profile.gnss_bias_sigma),
             recipe: is_named("recipe").then_some(profile.recipe),
             target_classes: is_named("target_classes").then_some(profile.target_classes),
@@ -179,6 +187,7 @@ impl CameraChange {
             display_name: self.display_name.unwrap_or(profile.display_name),
             image_size: self.image_size.unwrap_or(profile.image_size),
             gnss_error: self.gnss_error.unwrap_or(profile.gnss_error),
+            location: self.location.unwrap_or(profile.location),
             gnss_bias_sigma: self.gnss_bias_sigma.unwrap_or(profile.gnss_bias_sigma),
             recipe: self.recipe.unwrap_or(profile.recipe),
             target_classes: self.target_classes.unwrap_or(profile.target_classes),
@@ -209,7 +218,7 @@ impl From<CameraKey> for i64 {
     }
 }
 
-/// What a change of a camera or a site is based on: refused if it is another one by now, or has been changed.
+/// The version that a change of a camera or a site is based on. The change is refused if another version is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ExpectedVersion<K = CameraKey> {
     /// The key, if the caller knows which of those that had the id it means.
@@ -262,7 +271,7 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// What a change of it is based on.
+    /// Returns the version that a change of this camera is based on.
     #[must_use]
     pub const fn version(&self) -> ExpectedVersion {
         ExpectedVersion { key: Some(self.key), revision: self.revision }

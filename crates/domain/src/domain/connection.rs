@@ -16,7 +16,7 @@ pub struct NewConnection {
     pub id: ConnectionId,
     /// Display name.
     pub display_name: String,
-    /// Whether it is at rest.
+    /// True if the connection is paused.
     pub paused: bool,
     /// Address, format and what goes where, as JSON.
     pub settings: String,
@@ -55,7 +55,7 @@ impl From<ConnectionKey> for i64 {
 pub struct Connection {
     /// Identity of this connection among all that had its id.
     pub key: ConnectionKey,
-    /// What the operator defined.
+    /// The settings that the operator defined.
     pub profile: NewConnection,
     /// Counts its changes, from 1.
     pub revision: Revision,
@@ -66,7 +66,7 @@ pub struct Connection {
 }
 
 impl Connection {
-    /// What a change of it is based on.
+    /// Returns the version that a change of this connection is based on.
     #[must_use]
     pub const fn version(&self) -> ExpectedVersion<ConnectionKey> {
         ExpectedVersion { key: Some(self.key), revision: self.revision }
@@ -89,7 +89,7 @@ pub struct OutboxMessage {
     pub message_id: String,
     /// Where it goes at the receiver, such as the topic.
     pub subject: String,
-    /// Content.
+    /// Content of the message.
     pub payload: Vec<u8>,
     /// When it was made.
     pub created_at: Timestamp,
@@ -118,13 +118,13 @@ pub struct SourceOffset {
 /// A message that the receiver refused, or that could not be delivered for too long.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DeadLetter {
-    /// The message.
+    /// The message that was not delivered.
     pub message: OutboxMessage,
     /// Why it is not tried any more.
     pub reason: String,
 }
 
-/// What is in the outbox of a connection.
+/// Numbers of messages in the outbox of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct OutboxCounts {
     /// Messages that wait.

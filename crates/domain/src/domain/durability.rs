@@ -1,4 +1,4 @@
-//! What is guaranteed of stored samples when they are acknowledged.
+//! The guarantee for stored samples when they are acknowledged.
 
 use strum::{Display, EnumString, IntoStaticStr};
 

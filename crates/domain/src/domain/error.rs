@@ -175,7 +175,7 @@ pub fn convert_all<T, R>(
 pub struct Violation {
     /// Path of the field, dotted, with indexes in brackets: `observations[3].bounding_box.width_px`.
     pub field: String,
-    /// What is wrong and what is valid.
+    /// States the fault and the valid values.
     pub message: String,
 }
 

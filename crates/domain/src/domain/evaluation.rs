@@ -45,13 +45,13 @@ impl TimeRange {
         self.until
     }
 
-    /// Whether an instant lies within.
+    /// True if an instant lies in the range.
     #[must_use]
     pub fn contains(self, time: Timestamp) -> bool {
         self.from.is_none_or(|from| from <= time) && self.until.is_none_or(|until| time < until)
     }
 
-    /// Whether some instant is in both ranges.
+    /// True if some instant is in both ranges.
     #[must_use]
     pub fn overlaps(self, other: Self) -> bool {
         let ends_before = |one: Self, next: Self| matches!((one.until, next.from), (Some(until), Some(from)) if until <= from);

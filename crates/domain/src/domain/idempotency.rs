@@ -61,7 +61,7 @@ impl RequestHasher {
 pub struct IdempotentRequest {
     /// The client's key.
     pub key: IdempotencyKey,
-    /// What is asked for; complete once the body has been read.
+    /// The hash of the request's content; complete once the body has been read.
     pub hasher: RequestHasher,
 }
 

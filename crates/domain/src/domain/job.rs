@@ -72,7 +72,7 @@ impl JobState {
         self.into()
     }
 
-    /// Whether the state is final.
+    /// True if the state is final.
     #[must_use]
     pub const fn has_ended(self) -> bool {
         matches!(self, Self::Succeeded | Self::Failed | Self::Cancelled)

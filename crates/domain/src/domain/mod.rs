@@ -3,7 +3,7 @@
 //! Every check on a number is in a constructor here or in [`crate::geo`]; the layers above rely on
 //! it and do not check again.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod access;
@@ -17,6 +17,7 @@ mod error;
 mod evaluation;
 mod gnss_error;
 mod idempotency;
+mod image_area;
 mod job;
 mod live_id;
 mod method;
@@ -38,7 +39,7 @@ mod score;
 mod site;
 mod site_training;
 mod time;
-mod training;
+mod training_run;
 
 pub use access::{ApiKey, KeyId, KeySecret, NewKey, Role, Scope, SecretDigest};
 pub use audit::{Actor, AuditAction, AuditEntry, AuditNumber};
@@ -54,6 +55,7 @@ pub use error::{Error, ErrorKind, Fault, MOST_VIOLATIONS, Refusal, Result, Viola
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssBiasSigma, GnssError, SigmaM};
 pub use idempotency::{IdempotencyKey, IdempotentRequest, RequestDigest, RequestHasher};
+pub use image_area::ImageArea;
 pub use job::{EvaluationId, JobState, RunId};
 pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
@@ -78,7 +80,7 @@ pub use score::Score;
 pub use site::{NewSite, Site, SiteChange, SiteKey};
 pub use site_training::{SiteCameraFinding, SiteTrainingOptions, SiteTrainingReport};
 pub use time::{TimeBounds, parse_time, parse_time_in, parse_time_zone};
-pub use training::{
+pub use training_run::{
     CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,
     HeldOutSampleError, JointTraining, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions,
     TrainingReport, TrainingRun, TrainingSubject,

@@ -57,7 +57,7 @@ pub struct Course {
 }
 
 impl Motion {
-    /// Of a velocity whose error has that covariance, m2/s2.
+    /// Returns the motion of a velocity whose error has that covariance, m2/s2.
     ///
     /// The error along the velocity is one of speed, that across it one of course. Near 0 the error across is one of
     /// speed too: the upper bound is that of the distance to the origin, exact for an isotropic covariance at speed 0.

@@ -136,6 +136,14 @@ impl From<ReceiverId> for TargetId {
     }
 }
 
+impl TargetId {
+    /// The number of the tracker as it was sent, if that names the target, else the target's name.
+    #[must_use]
+    pub fn as_sent(&self) -> &str {
+        self.as_str().strip_prefix(TRACKER_PREFIX).unwrap_or(self.as_str())
+    }
+}
+
 /// A box whose target is not known has a target of its own, which no receiver's fixes are taken for.
 impl From<&TrackerId> for TargetId {
     fn from(tracker_id: &TrackerId) -> Self {

@@ -16,14 +16,14 @@ impl fmt::Display for NodeId {
     }
 }
 
-/// What a node says of itself.
+/// A node's own description.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NodeProfile {
     /// Where clients reach it, such as `https://node-1.example.org:8443`, if they do.
     pub url: Option<String>,
     /// Name of its role.
     pub role: String,
-    /// Its version.
+    /// The node's version of the program.
     pub version: String,
     /// How long it counts as alive without another renewal.
     pub lease: Duration,
@@ -34,13 +34,13 @@ pub struct NodeProfile {
 /// A registered node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Node {
-    /// Its id.
+    /// The node's id.
     pub id: NodeId,
-    /// What it says of itself.
+    /// The node's own description.
     pub profile: NodeProfile,
     /// The number of its latest renewal, drawn at random.
     pub renewal: i64,
-    /// Whether it is shutting down.
+    /// True if the node is shutting down.
     pub is_draining: bool,
     /// When it renewed its registration last, by the clock of the database; for people, nothing is decided by it.
     pub renewed_at: Timestamp,

@@ -51,7 +51,7 @@ pub struct GaussMarkovNoise {
 }
 
 impl GaussMarkovNoise {
-    /// The error of a phone in the open, of which nothing else is known: 2.6 m per axis, most of it over half a minute.
+    /// The error of an unknown receiver, a phone in the open: 2.6 m per axis, most of it over half a minute.
     pub const PHONE: Self = Self {
         variance_m2: 2.61 * 2.61,
         correlation: NoiseCorrelation { white_share: 0.083, time_constant_s: 30.0 },

@@ -90,7 +90,7 @@ impl Observation {
         Ok(Self { time, target_id, tracker_id: None, bounding_box, fix })
     }
 
-    /// Of a box that has only the number of its camera's tracker.
+    /// Returns the observation of a box that has only the number of its camera's tracker.
     ///
     /// # Errors
     /// Names `tracker_id` beside a target or a fix, whose target would be known.
@@ -104,13 +104,20 @@ impl Observation {
         Ok(Self { tracker_id, ..self })
     }
 
+    /// The name under which the camera's tracker follows the target: its number, else the target. It stays when the
+    /// target of the number becomes known.
+    #[must_use]
+    pub fn tracked_as(&self) -> Option<TargetId> {
+        self.tracker_id.as_ref().map(TargetId::from).or_else(|| self.target_id.clone())
+    }
+
     /// The same of a known target.
     #[must_use]
     pub fn with_target(self, target_id: TargetId) -> Self {
         Self { target_id: Some(target_id), ..self }
     }
 
-    /// Of a fix, with or without a box.
+    /// Returns the observation of a fix, with or without a box.
     #[must_use]
     pub const fn with_fix(
         time: Timestamp,

@@ -1,10 +1,10 @@
-//! What an import does with samples that are stored already.
+//! The rule of an import for samples that are stored already.
 
 use strum::{Display, EnumString, IntoStaticStr};
 
 use super::error::Error;
 
-/// What becomes of a sample whose camera, target and time are stored already.
+/// The rule for a sample whose camera, target and time are stored already.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Display, EnumString, IntoStaticStr)]
 #[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_choice)]
 pub enum OnConflict {

@@ -129,7 +129,7 @@ impl Receivers {
         self.0.values()
     }
 
-    /// Whether there are none.
+    /// True if there are no receivers.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()

@@ -1,4 +1,4 @@
-//! What a camera without a model has recorded, as it is stored.
+//! A stored part of the recording of a camera without a model.
 
 use jiff::Timestamp;
 

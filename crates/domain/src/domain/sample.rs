@@ -81,6 +81,6 @@ impl From<StoredSample> for Detection {
 pub struct SampleCount {
     /// All of them.
     pub all: u64,
-    /// Of these, those without a fix.
+    /// Number of these samples without a fix.
     pub without_fix: u64,
 }

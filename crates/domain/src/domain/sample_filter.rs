@@ -13,14 +13,14 @@ pub struct SampleFilter {
     pub from: Option<Timestamp>,
     /// Before this instant.
     pub until: Option<Timestamp>,
-    /// Of this target alone.
+    /// Only samples of this target.
     pub target_id: Option<TargetId>,
     /// Only samples that have a fix, or only those that have none.
     pub has_fix: Option<bool>,
 }
 
 impl SampleFilter {
-    /// All samples of a stretch of time.
+    /// All samples of an interval of time.
     #[must_use]
     pub fn within(range: TimeRange) -> Self {
         Self { from: range.from(), until: range.until(), ..Self::default() }

@@ -1,8 +1,8 @@
-//! What happens to samples of a camera that has as many as it may.
+//! The rule for new samples of a camera that has reached its limit.
 
 use serde::{Deserialize, Serialize};
 
-/// What happens when a camera has as many samples as it may.
+/// The rule for new samples of a camera that has reached its limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SampleOverflow {

@@ -100,7 +100,7 @@ impl From<SiteKey> for i64 {
 pub struct Site {
     /// Identity of this site among all that had its id.
     pub key: SiteKey,
-    /// What the operator defined.
+    /// The settings that the operator defined.
     pub profile: NewSite,
     /// Revision of the profile.
     pub revision: Revision,
@@ -113,7 +113,7 @@ pub struct Site {
 }
 
 impl Site {
-    /// What a change of it is based on.
+    /// Returns the version that a change of this site is based on.
     #[must_use]
     pub const fn version(&self) -> ExpectedVersion<SiteKey> {
         ExpectedVersion { key: Some(self.key), revision: self.revision }

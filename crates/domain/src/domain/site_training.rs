@@ -17,11 +17,11 @@ pub struct SiteTrainingOptions {
     pub until: Option<Timestamp>,
 }
 
-/// What a training run of a site found out. Everything but the counts is measured on receivers that the fits had not
+/// The findings of a training run of a site. Everything but the counts is measured on receivers that the fits had not
 /// seen.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct SiteTrainingReport {
-    /// Whether the versions of all cameras were activated; otherwise none was.
+    /// True if the versions of all cameras were activated; otherwise none was.
     pub is_activated: bool,
     /// Receivers that the cameras were trained on.
     pub receivers: u32,
@@ -38,7 +38,7 @@ pub struct SiteTrainingReport {
     pub cameras: Vec<SiteCameraFinding>,
 }
 
-/// What a training run of a site found out about a camera.
+/// The findings of a site's training run about one camera.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct SiteCameraFinding {
     /// The camera.

@@ -3,7 +3,7 @@
 //! Degrees are in [`Position`], metres in [`EastNorth`]; only a [`LocalPlane`] converts between them.
 //! All numbers are f64.
 
-// What clients send reaches this module: nothing in it may end the process.
+// Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 mod plane;

@@ -41,7 +41,7 @@ impl EastNorth {
         (east_m * east_m + north_m * north_m).sqrt()
     }
 
-    /// Whether the point lies within [`PLANE_RANGE_M`] of the origin; false if it is not finite.
+    /// True if the point lies within [`PLANE_RANGE_M`] of the origin; false if it is not finite.
     #[must_use]
     pub fn is_within_range(self) -> bool {
         self.east_m * self.east_m + self.north_m * self.north_m <= PLANE_RANGE_M * PLANE_RANGE_M
@@ -66,7 +66,7 @@ pub struct LocalPlane {
     constants: PlaneConstants,
 }
 
-/// What a [`LocalPlane`] computes with, for those who write its conversions in another language.
+/// The constants of a [`LocalPlane`], for those who write its conversions in another language.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlaneConstants {
     /// Sine of the origin's latitude.
@@ -107,7 +107,7 @@ impl LocalPlane {
         self.origin
     }
 
-    /// What the conversions compute with.
+    /// Returns the constants of the conversions.
     #[must_use]
     pub const fn constants(&self) -> &PlaneConstants {
         &self.constants

@@ -37,7 +37,7 @@ impl PlaneCovariance {
         Self { east_m2: east_m * east_m, north_m2: north_m * north_m, east_north_m2: east_m * north_m }
     }
 
-    /// Whether it is finite and positive definite.
+    /// True if it is finite and positive definite.
     #[must_use]
     pub fn is_positive(self) -> bool {
         let determinant = self.determinant();
@@ -81,7 +81,7 @@ impl PlaneCovariance {
         factor * major_m2.sqrt()
     }
 
-    /// Whether all elements are finite.
+    /// True if all elements are finite.
     #[must_use]
     pub fn is_finite(self) -> bool {
         [self.east_m2, self.north_m2, self.east_north_m2].into_iter().all(f64::is_finite)

@@ -62,7 +62,7 @@ impl Position {
         Self::new(self.latitude_deg, self.longitude_deg).ok()
     }
 
-    /// Whether the position is near a place only when it is swapped; near is within half a degree of both, which is
+    /// True if the position is near a place only when it is swapped; near is within half a degree of both, which is
     /// farther than a camera sees.
     #[must_use]
     pub fn is_swapped_at(self, place: Self) -> bool {

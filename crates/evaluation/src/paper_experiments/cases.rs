@@ -4,7 +4,7 @@ use super::splits::Split;
 use crate::domain::SigmaM;
 use crate::{Method, Truth};
 
-/// The methods of the main table, and three more of the tables behind it.
+/// The methods of the main table, and three more of the long tables.
 pub(super) const METHODS: &str = "gnss,imm_ukf,homography.denied,dnn.denied,paper.two_step,auto.one_step,\
                                   auto.two_step,track,paper.one_step,auto.denied,track.denied";
 
@@ -43,6 +43,6 @@ pub(super) struct Experiment {
     pub(super) gnss_sigma: SigmaM,
     pub(super) methods: Vec<Method>,
     pub(super) show_curves: bool,
-    /// Whether its cases are rows of the main table.
+    /// True if its cases are rows of the main table.
     pub(super) in_main_table: bool,
 }

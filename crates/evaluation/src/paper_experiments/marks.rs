@@ -3,7 +3,7 @@
 use super::cases::key;
 use super::scores::CaseScore;
 
-/// What the two-step fusion must not be worse than.
+/// The methods that the two-step fusion must not be worse than.
 const BASELINES: [&str; 3] = ["gnss", "homography.denied", "dnn.denied"];
 pub(super) const TWO_STEP: &str = "auto.two_step";
 pub(super) const ONE_STEP: &str = "auto.one_step";

@@ -50,7 +50,7 @@ pub struct RealCamera {
     pub image_size: Option<ImageSize>,
 }
 
-/// What was recorded, where it is at hand.
+/// The recorded data, as far as they are available.
 #[derive(Default)]
 pub struct Recordings {
     /// One person on a square.
@@ -69,7 +69,7 @@ impl Recordings {
 pub struct Document {
     /// Path relative to the folder of the page.
     pub path: String,
-    /// Its text.
+    /// The text of the file.
     pub text: String,
 }
 

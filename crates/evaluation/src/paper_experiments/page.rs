@@ -28,7 +28,6 @@ pub(super) struct Picture {
     pub(super) svg: String,
 }
 
-/// All pictures.
 pub(super) fn pictures(scores: &[CaseScore], curves: &[WalkCurves]) -> Vec<Picture> {
     let of = |key: &str| scores.iter().find(|score| score.case.key == key);
     let mut all = Vec::new();

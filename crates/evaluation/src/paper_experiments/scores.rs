@@ -36,7 +36,7 @@ pub(super) struct CaseScore {
     pub(super) methods: Vec<MethodScore>,
     /// Methods that could not run, with the reason.
     pub(super) failed: BTreeMap<String, String>,
-    /// Of the first world; empty if the experiment shows none.
+    /// Curves of the first world; empty if the experiment shows none.
     pub(super) curves: Vec<Curve>,
     /// The predictions of all worlds, where a picture shows them.
     pub(super) traces: Vec<Trace>,

@@ -44,7 +44,7 @@ struct Simulated<'a> {
 impl Simulated<'_> {
     fn experiment(self) -> anyhow::Result<Experiment> {
         let first = self.worlds[0].clone();
-        // What a user knows of a receiver is its error as a whole.
+        // A user knows the error of a receiver only as a whole.
         let sigma_m = first.gnss_sigma_m.hypot(first.gnss_bias_sigma_m);
         let case = |(key, title, test): &(&str, &str, TestSet)| Case {
             key: (*key).to_owned(),

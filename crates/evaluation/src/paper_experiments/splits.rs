@@ -72,7 +72,7 @@ impl Split {
         })
     }
 
-    /// What a fit learns from.
+    /// Returns the training input of a fit.
     pub(super) fn input(&self) -> FitInput<'_> {
         FitInput { samples: &self.train, unpaired: &self.unpaired }
     }

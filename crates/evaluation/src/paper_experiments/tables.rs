@@ -1,4 +1,4 @@
-//! The long tables behind the page: every method of every case, with the commands that reproduce it.
+//! The long tables of the page: every method of every case, with the commands that reproduce it.
 
 use std::fmt::Write as _;
 

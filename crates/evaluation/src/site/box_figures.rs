@@ -18,7 +18,7 @@ const JUDGED_AFTER_S: f64 = 2.0;
 pub struct BoxRecord {
     /// Index of the camera.
     pub camera: usize,
-    /// When.
+    /// The instant of the box.
     pub time: Timestamp,
     /// Number of the target, or of its visit; `None` for a false detection.
     pub target: Option<usize>,

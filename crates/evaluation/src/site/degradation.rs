@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use super::recording::{LabelledBox, RecordedCamera, SiteRecording};
 use crate::domain::{BoundingBox, ImageSize, TargetId};
 
-/// What goes wrong, and how often.
+/// The faults of the input, and how often they occur.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Degradation {
     /// Share of the boxes that are missed.

@@ -5,6 +5,10 @@
 
 mod box_figures;
 mod degradation;
+mod draw;
+mod matching_report;
+mod pair_figures;
+mod receiver_matching;
 mod recording;
 mod report;
 mod runner;
@@ -14,6 +18,9 @@ mod world_figures;
 
 pub use box_figures::{BoxFigures, BoxRecord};
 pub use degradation::Degradation;
+pub use matching_report::{JointFigures, MatchingCase, MatchingReport};
+pub use pair_figures::{Bin, PairFigures};
+pub use receiver_matching::JointFound;
 pub use recording::{LabelledBox, RecordedCamera, RecordedFix, SiteRecording, Visits};
 pub use report::{SiteCase, SiteReport};
 pub use runner::{Identities, SiteOutcome, SiteTraining, TrainedSite, site_fit_rows, track_site, train_site};

@@ -4,9 +4,9 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use jiff::Timestamp;
 
-use crate::domain::{BoundingBox, CameraId, GaussMarkovNoise, ImageSize, ReceivedFix, ReceiverId, TargetId};
+use crate::domain::{BoundingBox, CameraId, ImageSize, ReceivedFix, ReceiverId, TargetId};
 use crate::geo::{EastNorth, LocalPlane};
-use crate::simulation::{SimulatedReceiver, SimulatedSite};
+use crate::simulation::SimulatedSite;
 
 /// A target that no camera sees for longer than this begins another visit, s.
 const VISIT_GAP_S: f64 = 5.0;
@@ -14,7 +14,7 @@ const VISIT_GAP_S: f64 = 5.0;
 /// A detection with the target that it is of.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelledBox {
-    /// When.
+    /// The instant of the detection.
     pub time: Timestamp,
     /// The id by the camera's tracker.
     pub tracker_id: TargetId,
@@ -27,7 +27,7 @@ pub struct LabelledBox {
 /// The detections of one camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordedCamera {
-    /// Its id.
+    /// The id of the camera.
     pub id: CameraId,
     /// In the order of time.
     pub boxes: Vec<LabelledBox>,
@@ -142,32 +142,6 @@ impl SiteRecording {
         }
         visits
     }
-
-    /// The same fixes with other errors: those of receivers of that noise, drawn from a seed, at the true
-    /// positions of their carriers.
-    #[must_use]
-    pub fn with_redrawn_fixes(&self, noise: GaussMarkovNoise, seed: u64) -> Self {
-        let mut by_target: BTreeMap<usize, Vec<(Timestamp, EastNorth)>> = BTreeMap::new();
-        for ((time, target), position) in &self.truth {
-            by_target.entry(*target).or_default().push((*time, *position));
-        }
-        let mut drawn: BTreeMap<usize, (SimulatedReceiver, Timestamp)> = BTreeMap::new();
-        let mut redrawn = self.clone();
-        redrawn.fixes.retain_mut(|fix| {
-            let target = self.receivers[fix.receiver].1;
-            let Some(truth) = by_target.get(&target).and_then(|path| interpolated(path, fix.time)) else {
-                return false;
-            };
-            let (receiver, latest) = drawn
-                .entry(fix.receiver)
-                .or_insert_with(|| (SimulatedReceiver::seeded(noise, seed, fix.receiver as u64), fix.time));
-            let since_s = fix.time.duration_since(*latest).as_secs_f64();
-            *latest = fix.time;
-            fix.position = receiver.measure(truth, since_s);
-            true
-        });
-        redrawn
-    }
 }
 
 /// The visits of targets, numbered.
@@ -184,20 +158,4 @@ impl Visits {
         let earlier = self.begins.range((target, Timestamp::MIN)..=(target, time));
         earlier.map(|(_, number)| *number).next_back()
     }
-}
-
-/// A position on a path in the order of time; `None` beyond its ends.
-fn interpolated(path: &[(Timestamp, EastNorth)], time: Timestamp) -> Option<EastNorth> {
-    let next = path.partition_point(|(at, _)| *at < time);
-    let (next_time, to) = *path.get(next)?;
-    if next_time == time {
-        return Some(to);
-    }
-    let (previous_time, from) = path[next.checked_sub(1)?];
-    let part = time.duration_since(previous_time).as_secs_f64()
-        / next_time.duration_since(previous_time).as_secs_f64();
-    Some(EastNorth {
-        east_m: from.east_m + part * (to.east_m - from.east_m),
-        north_m: from.north_m + part * (to.north_m - from.north_m),
-    })
 }

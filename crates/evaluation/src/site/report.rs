@@ -9,7 +9,7 @@ use super::runner::SiteOutcome;
 /// The figures of one way to track a site, or their means over draws.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SiteCase {
-    /// What was done.
+    /// The name of the case.
     pub name: String,
     /// Identity F1 by boxes.
     pub identity_f1_by_boxes: f64,
@@ -27,7 +27,7 @@ pub struct SiteCase {
     pub gospa_m: f64,
     /// Mean error of the positions, m.
     pub mean_error_m: Option<f64>,
-    /// Of a camera alone: mean error, over the targets in its view, of the tracks by all cameras trained together, m.
+    /// For a single camera: mean error, over the targets in its view, of the tracks by all cameras trained together, m.
     pub mean_error_by_all_m: Option<f64>,
     /// Share of true positions inside the stated 95 % radius.
     pub coverage95: Option<f64>,

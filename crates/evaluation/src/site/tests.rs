@@ -3,6 +3,8 @@
 use jiff::{SignedDuration, Timestamp};
 
 use super::*;
+use crate::domain::{BoundingBox, TargetId};
+use crate::fusion::association::{MatchedPiece, Matching};
 use crate::fusion::world::WorldTrackId;
 use crate::geo::EastNorth;
 use crate::simulation::{SiteOptions, simulate_site};
@@ -159,4 +161,60 @@ fn degraded_boxes_cost_some_identity_not_most_of_it() {
     let rough = track_site(&degraded, &recording, &trained, Identities::Tracked, &[0, 1, 2]);
     println!("{clean:?}\n{rough:?}");
     assert!(rough.boxes.identity_f1 > clean.boxes.identity_f1 - 0.2, "{rough:?}");
+}
+
+fn small_site() -> SiteRecording {
+    let options =
+        SiteOptions { walkers: 8, vehicles: 0, cameras: 2, duration_s: 60.0, ..SiteOptions::default() };
+    SiteRecording::simulated(&simulate_site(&options))
+}
+
+#[test]
+fn a_draw_is_repeatable_and_keeps_the_truth() {
+    let site = small_site();
+    let (one, again, other) = (site.redrawn(3), site.redrawn(3), site.redrawn(4));
+    assert_eq!((&one.fixes, &one.cameras, &one.receivers), (&again.fixes, &again.cameras, &again.receivers));
+    assert_ne!(one.fixes, other.fixes);
+    assert_ne!(one.cameras, other.cameras);
+    assert_eq!(one.receivers.len(), site.receivers.len());
+    let paths = one.true_paths();
+    let mut squares = 0.0;
+    for fix in &one.fixes {
+        let truth = draw::position_at(&paths[&one.receivers[fix.receiver].1], fix.time).expect("on the path");
+        squares += 0.5 * fix.position.distance_m(truth).powi(2) / one.fixes.len() as f64;
+    }
+    // Four receivers of a minute each: few independent errors.
+    assert!((1.0..5.0).contains(&squares.sqrt()), "{squares}");
+    let boxes =
+        |recording: &SiteRecording| recording.cameras.iter().map(|own| own.boxes.len()).sum::<usize>();
+    let kept = boxes(&one) as f64 / boxes(&site) as f64;
+    assert!((0.94..0.99).contains(&kept), "{kept}");
+}
+
+#[test]
+fn pairs_are_counted_against_the_truth() {
+    let mut site = small_site();
+    let target = site.receivers[0].1;
+    let own = |at: usize, id: &str, target: usize| LabelledBox {
+        time: at_s(at as f64),
+        tracker_id: TargetId::new(id).expect("an id"),
+        bounding_box: BoundingBox::new(10.0, 10.0, 20.0, 50.0).expect("a box"),
+        target: Some(target),
+    };
+    site.cameras[0].boxes = (0..10).map(|at| own(at, "a", target)).collect();
+    site.cameras[0].boxes.extend((0..10).map(|at| own(at, "b", target + 1)));
+    let fix = |at: usize| RecordedFix { receiver: 0, time: at_s(at as f64), position: EastNorth::default() };
+    site.fixes = (0..10).map(fix).collect();
+    let piece = |id: &str, detections: std::ops::Range<usize>, probability| MatchedPiece {
+        tracker_id: TargetId::new(id).expect("an id"),
+        detections: detections.collect(),
+        receiver_id: site.receivers[0].0.clone(),
+        probability,
+    };
+    let pieces = vec![piece("a", 0..8, 0.92), piece("b", 10..20, 0.97), piece("a", 8..10, 0.6)];
+    let figures = PairFigures::of(&site, 0, &Matching { pieces, ..Matching::default() });
+    assert_eq!((figures.true_pairs, figures.found), (1, 1));
+    assert_eq!((figures.true_boxes, figures.found_boxes), (10, 8));
+    assert_eq!((figures.sure().pairs, figures.sure().right), (2, 1));
+    assert_eq!((figures.bins[2].pairs, figures.bins[2].right), (1, 1));
 }

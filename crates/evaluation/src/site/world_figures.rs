@@ -19,7 +19,7 @@ const MATCH_BENEFIT: f64 = 1_000.0;
 /// A track that is reported at an instant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReportedTrack {
-    /// Its number.
+    /// The number of the track.
     pub track: WorldTrackId,
     /// Its position, m.
     pub position: EastNorth,

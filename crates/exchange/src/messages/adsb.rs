@@ -74,7 +74,7 @@ impl Aircraft {
     }
 }
 
-/// Of a navigation accuracy category for position.
+/// The sigma of a navigation accuracy category for position.
 fn sigma_of_category(category: u8) -> Option<SigmaM> {
     const NAUTICAL_MILE_M: f64 = 1_852.0;
     let radius_95_m = match category {
@@ -120,7 +120,7 @@ fn line_item(line: &str, context: &MessageContext<'_>) -> Result<Option<MessageI
 /// The instant of a civil time whose offset from UTC is not known.
 fn nearest_zone(date: &str, time: &str, received_at: Timestamp) -> Result<Timestamp, String> {
     const QUARTER_S: f64 = 900.0;
-    /// Of the zones that there are, -12 to +14 hours.
+    /// The largest offset of a time zone: they go from -12 to +14 hours.
     const LARGEST_OFFSET_S: f64 = 50_400.0;
     let text = format!("{}T{time}", date.replace('/', "-"));
     let civil: DateTime =

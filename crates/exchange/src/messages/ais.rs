@@ -32,7 +32,7 @@ struct PartialMessage {
     received_at: Timestamp,
 }
 
-/// What of a sentence is used.
+/// The fields of a sentence that are used.
 struct Sentence<'a> {
     count: usize,
     number: usize,

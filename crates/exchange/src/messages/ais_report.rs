@@ -1,5 +1,5 @@
-//! What AIS messages say: position reports of types 1, 2, 3 (class A), 9 (aircraft of search and rescue), 18 and 19 (class B)
-//! and 27 (long range), and the place of the antenna in the ship of types 5, 19 and 24.
+//! The contents of AIS messages: position reports of types 1, 2, 3 (class A), 9 (aircraft of search and rescue), 18 and
+//! 19 (class B) and 27 (long range), and the place of the antenna in the ship of types 5, 19 and 24.
 //!
 //! Longitude 181 degrees and latitude 91 degrees mean that there is none. A report has the second of the minute only; it
 //! is the latest such instant before the message came, or before the time of its tag block (`c:`). A position is the

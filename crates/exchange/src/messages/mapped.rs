@@ -65,7 +65,7 @@ pub struct BoxMapping {
     /// Pointers to the four numbers, in the order of the form.
     #[schema(example = json!(["/bbox/0", "/bbox/1", "/bbox/2", "/bbox/3"]))]
     pub sides: [String; 4],
-    /// What the four numbers are.
+    /// The meaning of the four numbers.
     pub form: BoxForm,
     /// Their unit; pixels if left out.
     #[serde(default)]
@@ -73,7 +73,7 @@ pub struct BoxMapping {
 }
 
 impl JsonMapping {
-    /// Whether it reads fixes instead of boxes.
+    /// True if it reads fixes instead of boxes.
     #[must_use]
     pub const fn brings_fixes(&self) -> bool {
         self.bounding_box.is_none()

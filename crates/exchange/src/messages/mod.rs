@@ -57,7 +57,7 @@ pub enum MessageFormat {
 }
 
 impl MessageFormat {
-    /// Whether its messages contain fixes, not detections; those of `json` contain what their mapping says.
+    /// True if its messages contain fixes, not detections; those of `json` contain what their mapping says.
     #[must_use]
     pub const fn brings_fixes(self) -> bool {
         match self {
@@ -113,7 +113,7 @@ pub struct NamedDetection {
     pub score: Option<Score>,
 }
 
-/// What a message says.
+/// An item of a message.
 #[derive(Debug, Clone, PartialEq)]
 pub enum MessageItem {
     /// A target was seen.
@@ -122,7 +122,7 @@ pub enum MessageItem {
     Fix(ReceivedFix),
 }
 
-/// What was read from a message.
+/// The result of decoding a message.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Reading {
     /// In the order of the message.
@@ -177,7 +177,7 @@ impl ReportedFix<'_> {
 
 /// Reads the messages of one sender.
 pub trait MessageDecoder: Send {
-    /// What a message says.
+    /// Decodes a message.
     ///
     /// # Errors
     /// Why it cannot be read.

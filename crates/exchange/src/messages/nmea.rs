@@ -19,7 +19,7 @@ const MAX_RECEIVERS: usize = 1_024;
 /// Weeks after which the week number of GPS begins again.
 const ROLLOVER_S: i64 = 1_024 * 7 * 86_400;
 
-/// What tells receivers apart.
+/// The way to tell receivers apart.
 #[derive(PartialEq, Eq)]
 pub(super) enum Telling {
     Senders,

@@ -53,7 +53,7 @@ struct Frames {
     time: Option<String>,
     transformation: Option<Transformation>,
     object: Option<Object>,
-    /// Whether the text of the element that is open is the object's class.
+    /// True if the text of the element that is open is the object's class.
     reads_class: bool,
     /// The video source, where the stream names it.
     source: String,

@@ -39,7 +39,7 @@ enum Application {
     Form,
 }
 
-/// What tells applications apart.
+/// The fields that distinguish applications.
 #[derive(Deserialize)]
 struct Shape {
     #[serde(rename = "_type")]
@@ -70,7 +70,7 @@ impl Application {
     }
 }
 
-/// What the application of a body wants to read before it forgets what it has sent.
+/// The response that the application of a body must receive before it deletes what it has sent.
 pub(super) fn answer(payload: &[u8]) -> Option<&'static str> {
     match Application::of(payload).ok()? {
         Application::Empty | Application::OwnTracks => Some("[]"),
@@ -222,7 +222,7 @@ struct TraccarClient {
 struct TraccarLocation {
     timestamp: Option<String>,
     coords: Coordinates,
-    /// Whether another application makes up the positions.
+    /// True if another application makes up the positions.
     #[serde(default)]
     mock: bool,
 }

@@ -24,7 +24,7 @@ struct Position {
     fix_time: Option<String>,
     #[serde(default = "yes")]
     valid: bool,
-    /// Whether the receiver had no new fix and this is its last one.
+    /// True if the receiver had no new fix and this is its last one.
     #[serde(default)]
     outdated: bool,
     latitude: f64,

@@ -167,6 +167,45 @@ not json
 }
 
 #[test]
+fn solutions_of_rtklib_are_read_with_their_time_system() {
+    let columns = "latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)";
+    let row =
+        "2019/09/18 16:47:34.000   23.837350600   90.262550200   -36.2680   2  12   0.0300   0.0400   0.0081";
+    let file = format!(
+        "% program   : RTKLIB demo5 b34k\n% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float)\n{row}\n\
+         %  GPST                  {columns}\n{row}\n2071 319654.5, 23.8, 90.2, 0, 5, 7\n\n\
+         2019/09/18 16:47:34.000   95.0  90.2  0 1 12\nyesterday 8 1 2\n\
+         %  JST                   {columns}\n{row}\n%  GPST   x-ecef(m) y-ecef(m) z-ecef(m)\n{row}\n"
+    );
+    let shown = all_shown(&file, FixFormat::Rtklib);
+    let expected = [
+        "line 3: : no line before it begins with % GPST",
+        "2019-09-18T16:47:16Z - 90.262550 23.837351",
+        "2019-09-18T16:47:16.5Z - 90.200000 23.800000",
+        "line 8: latitude_deg: ",
+        "line 9: time: must be 2026/01/05",
+        "2019-09-18T07:47:34Z - 90.262550 23.837351",
+        "line 13: longitude(deg): is required: choose Lat/Lon/Height",
+    ];
+    assert_eq!(shown.len(), expected.len(), "{shown:?}");
+    for (shown, expected) in shown.iter().zip(expected) {
+        assert!(shown.starts_with(expected), "{shown} is not {expected}");
+    }
+    let rows = received(&file, FixFormat::Rtklib);
+    let sigma_m = |at: usize| rows[at].as_ref().expect("a fix").fix.sigma_m.expect("stated").metres();
+    assert!((sigma_m(1) - 0.035_36).abs() < 1e-5 && (sigma_m(2) - 5.303).abs() < 1e-3);
+}
+
+#[test]
+fn leap_seconds_are_those_of_the_date() {
+    let file = "%  GPST latitude(deg) longitude(deg)\n2016/12/31 12:00:00 1 2\n2017/01/01 00:00:18 1 2\n";
+    assert_eq!(
+        all_shown(file, FixFormat::Rtklib),
+        ["2016-12-31T11:59:43Z - 2.000000 1.000000", "2017-01-01T00:00:00Z - 2.000000 1.000000"]
+    );
+}
+
+#[test]
 fn a_csv_file_of_fixes_may_name_receivers() {
     let csv = "longitude,latitude,time,target_id,receiver_id\n\
                103.9,30.6,2020-12-14T06:41:48Z,person-1,phone\n\
@@ -215,7 +254,7 @@ proptest! {
     #[test]
     fn arbitrary_bytes_never_panic_as_fixes(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
         for &format in FixFormat::ALL {
-            for begin in ["", "<gpx><trkpt lat=\"1\" lon=\"2\">", "{\"class\":\"TPV\",", "$GPRMC,1", "time,longitude,latitude\n"] {
+            for begin in ["", "<gpx><trkpt lat=\"1\" lon=\"2\">", "{\"class\":\"TPV\",", "$GPRMC,1", "% GPST latitude(deg) longitude(deg)\n2026/", "time,longitude,latitude\n"] {
                 let text = [begin.as_bytes(), &bytes].concat();
                 if let Ok(rows) = read_received_fixes(&text[..], format, rules().time_bounds) {
                     rows.for_each(drop);

@@ -1,4 +1,4 @@
-//! What tests of messages share.
+//! Helpers that tests of messages share.
 
 use jiff::Timestamp;
 

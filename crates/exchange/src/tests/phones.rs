@@ -75,7 +75,7 @@ fn overland_sends_batches_and_wants_to_read_that_they_were_taken() {
     assert_eq!(fixes(&read(PHONE, &batch.replace("iphone", "")))[0].0, None, "an empty name is none");
 }
 
-/// What release 9.5.3 sends and a query of release 7.9, both of issue 85 of traccar-client.
+/// A message of release 9.5.3 and a query of release 7.9, both of issue 85 of traccar-client.
 #[test]
 fn traccar_client_sends_json_or_a_query() {
     let json = r#"{"location": {"timestamp": "2025-08-28T11:51:46.587Z", "coords": {"latitude": -37.6998277,

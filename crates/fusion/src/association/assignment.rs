@@ -29,7 +29,7 @@ struct Sampler<'a> {
     owner: Vec<Option<usize>>,
 }
 
-/// Posterior probabilities by receiver, then piece, of receivers with these chains, of which the first is
+/// Posterior probabilities by receiver, then piece, of receivers with these chains; the first chain is
 /// empty.
 ///
 /// # Errors
@@ -107,7 +107,7 @@ impl Sampler<'_> {
         self.chosen[receiver] = chain;
     }
 
-    /// Whether all pieces of a chain are free of owners but those.
+    /// True if no piece of a chain has another owner than those.
     fn is_free(&self, chain: &Chain, own: [usize; 2]) -> bool {
         chain.pieces.iter().all(|piece| self.owner[*piece].is_none_or(|owner| own.contains(&owner)))
     }

@@ -9,7 +9,7 @@ use crate::domain::{Error, ErrorKind, Result};
 pub struct Cancellation<'a>(&'a dyn Fn() -> bool);
 
 impl<'a> Cancellation<'a> {
-    /// Of a match that runs to its end.
+    /// Never cancels: the match runs to its end.
     pub const NEVER: Cancellation<'static> = Cancellation(&|| false);
 
     /// By a function that returns `true` once the match is to end.

@@ -42,7 +42,7 @@ impl Default for ChainSettings {
             max_chains: 60,
             max_gap_s: 2.5,
             seen_probability: 0.8,
-            seen_per_s: 0.2,
+            seen_per_s: 0.05,
             switch_probability: 0.2,
         }
     }

@@ -34,7 +34,7 @@ impl View {
         }
     }
 
-    /// Whether a companion of a box's target may be out of view.
+    /// True if a companion of a box's target may be out of view.
     fn is_at_border(&self, own: &BoundingBox) -> bool {
         let centre_px = own.left_px() + 0.5 * own.width_px();
         let apart_px = APART_HEIGHTS * own.height_px();

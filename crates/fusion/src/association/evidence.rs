@@ -3,8 +3,8 @@
 //!
 //! Carried: fix less position of the tracklet is white noise (receiver and detector) plus two
 //! Gauss-Markov processes, the receiver's bias and the error of the map. Somebody else: the fixes follow a
-//! target that starts anywhere in the scene and whose velocity is a Gauss-Markov process, plus the same
-//! receiver error. Both likelihoods are products of the innovations' densities of a Kalman filter, which
+//! target that starts anywhere in the scene and whose velocity is a Gauss-Markov process of one of three speeds, plus the
+//! same receiver error. Both likelihoods are products of the innovations' densities of a Kalman filter, which
 //! marginalises bias, map error and motion exactly. Axes are independent and alike, so both share one
 //! covariance.
 //!
@@ -30,7 +30,7 @@ const FREEDOM: f64 = 4.0;
 /// After so long a gap between fixes the motion of somebody else starts again, s.
 const MAX_GAP_S: f64 = 60.0;
 
-/// What the likelihoods assume.
+/// The assumptions of the likelihoods.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct EvidenceModel {
     /// Error of a receiver.
@@ -50,9 +50,9 @@ impl EvidenceModel {
 #[derive(Debug, Clone, Copy, Default)]
 struct Innovations {
     fixes: f64,
-    /// Of the logarithms of the variances of both axes.
+    /// Sum of the logarithms of the variances of both axes.
     log_determinant: f64,
-    /// Of the normalised squares, those of outliers bounded.
+    /// Sum of the normalised squares, those of outliers bounded.
     squares: f64,
 }
 
@@ -140,15 +140,15 @@ impl FreeMotion {
     }
 
     /// Evidence of a fix given those before.
-    fn step(&mut self, fix: &TimedFix, model: &EvidenceModel) -> Innovations {
+    fn step(&mut self, fix: &TimedFix, speed_m_s: f64, model: &EvidenceModel) -> Innovations {
         let (bias_m2, white_m2) = (model.bias_m2(fix), model.gnss.white_variance_m2());
         let position = [fix.position.east_m, fix.position.north_m];
         let elapsed_s = self.last_s.map(|last_s| (fix.time_s - last_s).max(0.0));
         self.last_s = Some(fix.time_s);
         match elapsed_s.filter(|elapsed_s| *elapsed_s <= MAX_GAP_S) {
-            None => self.start(position, bias_m2, white_m2, model),
+            None => self.start(position, bias_m2, white_m2, (speed_m_s, model.motion.spread_m)),
             Some(elapsed_s) => {
-                self.predict(elapsed_s, bias_m2, model);
+                self.predict(elapsed_s, bias_m2, speed_m_s, model);
                 self.filter.update(position, [true, false, true], white_m2)
             }
         }
@@ -160,9 +160,8 @@ impl FreeMotion {
         position: [f64; 2],
         bias_m2: f64,
         white_m2: f64,
-        model: &EvidenceModel,
+        (speed_m_s, spread_m): (f64, f64),
     ) -> Innovations {
-        let SceneMotion { spread_m, speed_m_s } = model.motion;
         self.filter = AxisFilter {
             means: position.map(|axis| [axis, 0.0, 0.0]),
             covariance: [
@@ -175,8 +174,8 @@ impl FreeMotion {
         Innovations { fixes: 1.0, log_determinant: 2.0 * variance_m2.ln(), squares: 2.0 }
     }
 
-    fn predict(&mut self, elapsed_s: f64, bias_m2: f64, model: &EvidenceModel) {
-        let speed_m2_s2 = model.motion.speed_m_s.powi(2);
+    fn predict(&mut self, elapsed_s: f64, bias_m2: f64, speed_m_s: f64, model: &EvidenceModel) {
+        let speed_m2_s2 = speed_m_s.powi(2);
         let tau_s = VELOCITY_TIME_CONSTANT_S;
         let velocity = (-elapsed_s / tau_s).exp();
         let lever_s = tau_s * (1.0 - velocity);
@@ -204,10 +203,34 @@ impl FreeMotion {
     }
 }
 
-/// Log-likelihood of fixes (in order of time) of somebody who is not seen.
+/// Somebody else, who is slow, usual or fast with equal probabilities: fixes that stand are no evidence for who is near.
+#[derive(Debug, Clone, Copy)]
+struct SomebodyElse([(FreeMotion, Innovations); 3]);
+
+impl SomebodyElse {
+    const fn new() -> Self {
+        let none = Innovations { fixes: 0.0, log_determinant: 0.0, squares: 0.0 };
+        Self([(FreeMotion::new(), none); 3])
+    }
+
+    fn step(&mut self, fix: &TimedFix, model: &EvidenceModel) {
+        for ((motion, sum), speed_m_s) in self.0.iter_mut().zip(model.motion.speeds_m_s) {
+            sum.add(motion.step(fix, speed_m_s, model));
+        }
+    }
+
+    /// Logarithm of the mean of the densities of the three speeds.
+    fn log_density(&self, of: impl Fn(&Innovations) -> f64) -> f64 {
+        let each = self.0.map(|(_, sum)| of(&sum));
+        let most = each.into_iter().fold(f64::NEG_INFINITY, f64::max);
+        most + (each.iter().map(|own| (own - most).exp()).sum::<f64>() / each.len() as f64).ln()
+    }
+}
+
+/// Log-likelihood of fixes (in order of time) of somebody who is not seen, at the speed of the scene.
 pub(super) fn free_log_likelihood(fixes: &[TimedFix], model: &EvidenceModel) -> f64 {
     let (mut motion, mut sum) = (FreeMotion::new(), Innovations::default());
-    fixes.iter().for_each(|fix| sum.add(motion.step(fix, model)));
+    fixes.iter().for_each(|fix| sum.add(motion.step(fix, model.motion.speed_m_s, model)));
     sum.normal_log_density()
 }
 
@@ -216,29 +239,30 @@ pub(super) fn free_log_likelihood(fixes: &[TimedFix], model: &EvidenceModel) -> 
 pub(super) struct LikelihoodRatio {
     /// Bias and map error.
     carried: AxisFilter<2>,
-    free: FreeMotion,
-    /// Evidence of both.
-    innovations: [Innovations; 2],
+    carried_sum: Innovations,
+    other: SomebodyElse,
+    last_s: Option<f64>,
 }
 
 impl LikelihoodRatio {
     pub(super) const fn new() -> Self {
-        let carried = AxisFilter { means: [[0.0; 2]; 2], covariance: [[0.0; 2]; 2] };
-        let none = Innovations { fixes: 0.0, log_determinant: 0.0, squares: 0.0 };
-        Self { carried, free: FreeMotion::new(), innovations: [none; 2] }
+        Self {
+            carried: AxisFilter { means: [[0.0; 2]; 2], covariance: [[0.0; 2]; 2] },
+            carried_sum: Innovations { fixes: 0.0, log_determinant: 0.0, squares: 0.0 },
+            other: SomebodyElse::new(),
+            last_s: None,
+        }
     }
 
     /// Logarithm of the ratio.
     pub(super) fn log_ratio(&self) -> f64 {
-        let [carried, free] = self.innovations.map(|own| own.log_density());
-        carried - free
+        self.carried_sum.log_density() - self.other.log_density(Innovations::log_density)
     }
 
     /// The same if the covariances are known.
     #[cfg(test)]
     pub(super) fn normal_log_ratio(&self) -> f64 {
-        let [carried, free] = self.innovations.map(|own| own.normal_log_density());
-        carried - free
+        self.carried_sum.normal_log_density() - self.other.log_density(Innovations::normal_log_density)
     }
 
     /// The ratio after more residuals, in order of time.
@@ -252,7 +276,7 @@ impl LikelihoodRatio {
     pub(super) fn step(&mut self, residual: &Residual, model: &EvidenceModel) {
         let (fix, map_m2) = (&residual.fix, residual.map_variance_m2);
         let bias_m2 = model.bias_m2(fix);
-        match self.free.last_s {
+        match self.last_s {
             None => self.carried.covariance = [[bias_m2, 0.0], [0.0, map_m2]],
             Some(last_s) => {
                 let elapsed_s = (fix.time_s - last_s).max(0.0);
@@ -261,8 +285,9 @@ impl LikelihoodRatio {
                 self.carried.decay([bias, map], [bias_m2 * (1.0 - bias * bias), map_m2 * (1.0 - map * map)]);
             }
         }
+        self.last_s = Some(fix.time_s);
         let noise_m2 = model.gnss.white_variance_m2() + residual.box_variance_m2;
-        self.innovations[0].add(self.carried.update(residual.difference_m, [true; 2], noise_m2));
-        self.innovations[1].add(self.free.step(fix, model));
+        self.carried_sum.add(self.carried.update(residual.difference_m, [true; 2], noise_m2));
+        self.other.step(fix, model);
     }
 }

@@ -14,7 +14,7 @@ use rand::Rng;
 use super::cancellation::Cancellation;
 use super::evidence::EvidenceModel;
 use super::matching::{
-    Located, MatchSettings, Matching, check_size, match_located, match_scene, receiver_noise,
+    Located, MatchSettings, Matching, check_size, clock_grid, match_located, match_scene, receiver_noise,
 };
 use super::placement::{Density, GroundPrior, Placement, PlacementSearch};
 use super::recording::Scene;
@@ -41,10 +41,10 @@ const MIN_MODE_MARGIN: f64 = 3.0;
 const SAME_WORLD: f64 = 6.0;
 /// Sure pieces at least: one or two straight walks fit more than one place and direction.
 const MIN_PIECES: usize = 3;
-/// The trained model departs from the placement by at most so many standard deviations of the latter in the
+/// The trained model departs from the placement by at most this number of standard deviations of the latter in the
 /// mean.
 const MAX_DEPARTURE: f64 = 5.0;
-/// What is known about the ground of targets whose height is known: people and cars.
+/// The prior of the ground for targets of known height: people and cars.
 const GROUND_OF_KNOWN_HEIGHT: GroundPrior =
     GroundPrior { map_sigma_m: 1.0, scale_sigma: 0.06, density: Density::Fixes };
 /// The same of all others, such as ships: the antenna stands somewhere on a large target, far away near the horizon.
@@ -65,7 +65,7 @@ const MAX_HALVES_DISTANCE: f64 = 3.0;
 /// Placements kept per ground camera.
 const MODES: usize = 12;
 
-/// What was found, and the model that was trained on it.
+/// The match, and the model that was trained on it.
 #[derive(Debug, Clone)]
 pub struct JointMatch {
     /// Which boxes show which receivers' carriers.
@@ -79,11 +79,11 @@ pub struct JointMatch {
 /// Scores of placements: sums over receivers of the log of prior plus evidence.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WorldScores {
-    /// Of the world found.
+    /// The score of the world found.
     pub best: f64,
-    /// Of the best world with clocks shifted.
+    /// The score of the best world with clocks shifted.
     pub best_shifted: f64,
-    /// Of the best other world, with true clocks; negative infinity if there is none.
+    /// The score of the best other world, with true clocks; negative infinity if there is none.
     pub second: f64,
 }
 
@@ -187,13 +187,20 @@ impl<'a> JointSearch<'a> {
     fn search(&self, camera: usize, fixes: &[Vec<TimedFix>]) -> PlacementSearch {
         let tracklets = self.on_ground(camera);
         let log_prior = self.cameras[camera].log_prior();
-        PlacementSearch::new(&tracklets, fixes, &self.model, &self.ground, log_prior)
+        PlacementSearch::new(
+            &tracklets,
+            fixes,
+            &clock_grid(self.settings),
+            &self.model,
+            &self.ground,
+            log_prior,
+        )
     }
 
     /// The best world, if it is better than all that must be wrong and all others that may be right.
     fn accepted_world(&self) -> Result<(World, WorldScores)> {
         let worlds = self.worlds(0..self.cameras.len(), &self.fixes);
-        // What was cancelled has found nothing.
+        // A cancelled match has found nothing.
         self.scene.cancellation.check()?;
         let Some(best) = worlds.first().copied() else {
             return Err(not_identifiable(
@@ -390,7 +397,7 @@ impl<'a> JointSearch<'a> {
     }
 }
 
-/// Whether a world is better than those that must be wrong and all others.
+/// Checks that a world is better than those that must be wrong and all others.
 fn check_scores(scores: &WorldScores, min_margin: f64) -> Result<()> {
     if scores.best < scores.best_shifted + min_margin {
         return Err(not_identifiable(
@@ -432,7 +439,9 @@ fn common_motion(scene: &Scene<'_>, cameras: &[GroundCamera], ground: &GroundPri
     let mean = |of: fn(&SceneMotion) -> f64| {
         (motions.iter().map(|motion| of(motion).ln()).sum::<f64>() / motions.len().max(1) as f64).exp()
     };
-    SceneMotion { spread_m: mean(|own| own.spread_m), speed_m_s: mean(|own| own.speed_m_s) }
+    let speed_m_s = mean(|own| own.speed_m_s);
+    // The search takes one speed for all.
+    SceneMotion { spread_m: mean(|own| own.spread_m), speed_m_s, speeds_m_s: [speed_m_s; 3] }
 }
 
 fn motion_of_receivers(fixes: &[Vec<TimedFix>]) -> SceneMotion {

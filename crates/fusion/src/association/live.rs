@@ -43,7 +43,7 @@ impl Default for LiveMatchSettings {
     }
 }
 
-/// After so many boxes in a row that are older than the window, the recording has begun again.
+/// After this number of boxes in a row that are older than the window, the recording has begun again.
 const RESTART_AFTER: u32 = 50;
 
 /// The latest boxes and fixes, in the order in which they came.
@@ -87,7 +87,7 @@ impl LiveWindow {
         }
     }
 
-    /// Whether it has boxes and fixes.
+    /// True if it has boxes and fixes.
     #[must_use]
     pub fn can_be_matched(&self) -> bool {
         !self.detections.is_empty() && !self.fixes.is_empty()
@@ -210,7 +210,7 @@ impl LiveMatches {
     }
 
     /// The matches after the window's boxes were matched again. Of each tracker's id the piece with its latest box counts:
-    /// what was found before a cut is no evidence about the target behind it.
+    /// what was found before a cut is no evidence about the target after it.
     #[must_use]
     pub fn updated(
         &self,

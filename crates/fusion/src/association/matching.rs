@@ -202,7 +202,7 @@ pub(super) fn check_size(scene: &Scene<'_>, settings: &MatchSettings) -> Result<
 }
 
 fn check_comparisons(scene: &Scene<'_>, settings: &MatchSettings) -> Result<()> {
-    let comparisons = scene.comparisons().saturating_mul(clock_offsets(settings) as u64);
+    let comparisons = scene.comparisons().saturating_mul(passes(settings));
     if comparisons > settings.limits.comparisons {
         let message = format!(
             "there are {comparisons} comparisons of fixes with tracklets, at most {} are made at once \
@@ -274,28 +274,27 @@ fn clock_offsets_s(
     settings: &MatchSettings,
     cancellation: Cancellation<'_>,
 ) -> Result<Vec<f64>> {
-    let window_s = settings.clock_window_s;
-    let steps = clock_steps(settings);
-    if steps < 1 {
+    let offsets_s = clock_grid(settings);
+    if offsets_s.len() == 1 {
         return Ok(vec![0.0; located.fixes.len()]);
     }
     let whole = |(tracklet, own): (usize, &Tracklet)| Piece { tracklet, first: 0, end: own.points.len() };
     let pieces = located.tracklets.iter().enumerate().map(whole).collect();
     let table = PieceTable::new(located.tracklets, pieces, model.motion, &settings.chains);
-    let evidence = |fixes: &[TimedFix], offset_s: f64| {
+    let evidence = |fixes: &[TimedFix], (offset_s, log_prior): (f64, f64)| {
         let chains = table.chains(fixes, offset_s, model, &settings.chains);
         let most = chains.iter().map(|own| own.log_weight).fold(f64::NEG_INFINITY, f64::max);
         let sum: f64 = chains.iter().map(|own| (own.log_weight - most).exp()).sum();
-        most + sum.ln() - 0.5 * (2.0 * offset_s / window_s).powi(2)
+        most + sum.ln() + log_prior
     };
     let best = |fixes: &Vec<TimedFix>| {
         let mut best = (0.0, f64::NEG_INFINITY);
-        for offset_s in (-steps..=steps).map(|step| f64::from(step) * OFFSET_STEP_S) {
+        for offset in &offsets_s {
             cancellation.check()?;
-            let evidence = evidence(fixes, offset_s);
-            // Of equals the last.
+            let evidence = evidence(fixes, *offset);
+            // Among equals the last.
             if evidence.total_cmp(&best.1).is_ge() {
-                best = (offset_s, evidence);
+                best = (offset.0, evidence);
             }
         }
         Ok(best.0)
@@ -303,15 +302,22 @@ fn clock_offsets_s(
     located.fixes.iter().map(best).collect()
 }
 
-/// Steps of the search for a clock offset to either side.
-fn clock_steps(settings: &MatchSettings) -> i32 {
-    (settings.clock_window_s / OFFSET_STEP_S).floor() as i32
+/// The clock offsets that are tried, s, with the logarithms of their prior probabilities: normal, with half of the window as
+/// standard deviation.
+pub(super) fn clock_grid(settings: &MatchSettings) -> Vec<(f64, f64)> {
+    let steps = (settings.clock_window_s / OFFSET_STEP_S).floor() as i32;
+    let offsets_s = (-steps..=steps).map(|step| f64::from(step) * OFFSET_STEP_S);
+    let sigma_s = 0.5 * settings.clock_window_s.max(OFFSET_STEP_S);
+    let weighed: Vec<(f64, f64)> =
+        offsets_s.map(|offset_s| (offset_s, -0.5 * (offset_s / sigma_s).powi(2))).collect();
+    let log_sum = weighed.iter().map(|(_, log_weight)| log_weight.exp()).sum::<f64>().ln();
+    weighed.into_iter().map(|(offset_s, log_weight)| (offset_s, log_weight - log_sum)).collect()
 }
 
 /// Passes over all comparisons: one for each clock offset that is tried, and that with the best.
-fn clock_offsets(settings: &MatchSettings) -> i32 {
-    match clock_steps(settings) {
-        ..1 => 1,
-        steps => 2 * steps + 2,
+fn passes(settings: &MatchSettings) -> u64 {
+    match clock_grid(settings).len() as u64 {
+        1 => 1,
+        offsets => offsets + 1,
     }
 }

@@ -3,7 +3,7 @@
 //! [`match_with_model`] compares fixes with regressed positions; [`match_without_model`] finds the camera,
 //! too. `docs/explanation/association.md` has the formulas and figures. The files in the order of their imports:
 //! `cancellation`, `tracklet`, `disjoint`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`.
-//! Never here: I/O, clocks, randomness that is not handed in.
+//! Does not use I/O, clocks, or randomness that is not handed in.
 
 mod assignment;
 mod cancellation;

@@ -42,7 +42,7 @@ const ROUNDS: usize = 25;
 /// Log-likelihood ratios are multiplied by it: what the noise model leaves out makes them overstated.
 const TEMPERING: f64 = 0.6;
 
-/// What a likelihood ratio is the ratio of.
+/// The variable of the densities whose ratio is a likelihood ratio.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Density {
     /// Densities of the fixes, given the boxes.
@@ -59,7 +59,7 @@ pub(super) struct GroundPrior {
     pub(super) map_sigma_m: f64,
     /// Standard deviation of the logarithm of the scale.
     pub(super) scale_sigma: f64,
-    /// What the evidence is a density of.
+    /// The variable of the evidence's density.
     pub(super) density: Density,
 }
 
@@ -148,7 +148,8 @@ impl Pair {
     }
 }
 
-/// The tracklets that the carrier of one receiver may have, in the order of their last instants.
+/// The tracklets that the carrier of one receiver may have, in the order of their last instants, each with every clock offset
+/// that is tried.
 struct ReceiverPairs {
     pairs: Vec<Pair>,
     /// By pair, the number of those that end before it begins.
@@ -159,17 +160,23 @@ impl ReceiverPairs {
     fn new(
         tracklets: &[Tracklet],
         fixes: &[TimedFix],
+        offsets_s: &[(f64, f64)],
         (carried, other): (&EvidenceModel, &EvidenceModel),
         ground: &GroundPrior,
     ) -> Self {
-        let of_tracklet = |own| pair(own, fixes, (carried, other), ground);
-        let mut pairs: Vec<Pair> = tracklets.iter().filter_map(of_tracklet).collect();
+        let mut pairs = Vec::new();
+        for (offset_s, log_prior) in offsets_s {
+            let of_tracklet = |own| pair(own, fixes, *offset_s, (carried, other), ground);
+            let of_offset: Vec<Pair> = tracklets.iter().filter_map(of_tracklet).collect();
+            let spans_s: Vec<[f64; 2]> = of_offset.iter().map(|own| own.span_s).collect();
+            pairs.extend(of_offset.into_iter().map(|own| {
+                let candidates = concurrent(own.span_s, spans_s.iter().copied());
+                let log_odds = (SEEN_PROBABILITY / (1.0 - SEEN_PROBABILITY) / candidates).ln();
+                Pair { log_prior_odds: log_odds + log_prior, ..own }
+            }));
+        }
         pairs.sort_by(|one, other| one.span_s[1].total_cmp(&other.span_s[1]));
         let spans_s: Vec<[f64; 2]> = pairs.iter().map(|own| own.span_s).collect();
-        for own in &mut pairs {
-            let candidates = concurrent(own.span_s, spans_s.iter().copied());
-            own.log_prior_odds = (SEEN_PROBABILITY / (1.0 - SEEN_PROBABILITY) / candidates).ln();
-        }
         Self { pairs, before: disjoint::ended_before(&spans_s) }
     }
 
@@ -207,10 +214,12 @@ pub(super) struct PlacementSearch {
 }
 
 impl PlacementSearch {
-    /// `tracklets` have positions (right, forward) instead of (east, north).
+    /// `tracklets` have positions (right, forward) instead of (east, north). `offsets_s` are the clock offsets that are tried,
+    /// each with the logarithm of its prior probability.
     pub(super) fn new(
         tracklets: &[Tracklet],
         receivers: &[Vec<TimedFix>],
+        offsets_s: &[(f64, f64)],
         model: &EvidenceModel,
         ground: &GroundPrior,
         log_prior: f64,
@@ -222,7 +231,7 @@ impl PlacementSearch {
         };
         let other = EvidenceModel { motion, ..*model };
         let of_receiver =
-            |fixes: &Vec<TimedFix>| ReceiverPairs::new(tracklets, fixes, (model, &other), ground);
+            |fixes: &Vec<TimedFix>| ReceiverPairs::new(tracklets, fixes, offsets_s, (model, &other), ground);
         let pairs = receivers.iter().map(of_receiver).collect();
         let all: Vec<C> = tracklets
             .iter()
@@ -370,7 +379,7 @@ impl PlacementSearch {
     }
 }
 
-/// Those that differ from all better ones by at least a distance, m; at most so many.
+/// Those that differ from all better ones by at least a distance, m, up to a number.
 fn distinct(sorted: &[Placement], points: &[C], most: usize, apart_m: f64) -> Vec<Placement> {
     let mut kept: Vec<Placement> = Vec::new();
     for own in sorted {
@@ -387,11 +396,12 @@ fn distinct(sorted: &[Placement], points: &[C], most: usize, apart_m: f64) -> Ve
 fn pair(
     tracklet: &Tracklet,
     fixes: &[TimedFix],
+    offset_s: f64,
     (model, other): (&EvidenceModel, &EvidenceModel),
     ground: &GroundPrior,
 ) -> Option<Pair> {
     let map_sigma_m = ground.map_sigma_m;
-    let residuals = tracklet.residuals(fixes, 0.0, MAX_GAP_S);
+    let residuals = tracklet.residuals(fixes, offset_s, MAX_GAP_S);
     let stride = residuals.len().div_ceil(MAX_FIXES).max(1);
     let rows: Vec<_> = residuals.into_iter().step_by(stride).collect();
     if rows.len() < MIN_FIXES {

@@ -21,7 +21,7 @@ pub(super) struct SeenTracklet {
     pub(super) detections: Vec<usize>,
 }
 
-/// What is matched.
+/// The input of a match.
 #[derive(Debug, Clone)]
 pub(super) struct Scene<'a> {
     pub(super) detections: &'a [Detection],

@@ -6,6 +6,7 @@ use super::cancellation::Cancellation;
 use super::chains::{Chain, ChainSettings};
 use super::cuts;
 use super::evidence::{EvidenceModel, LikelihoodRatio};
+use super::matching::{MatchSettings, clock_grid};
 use super::placement::{Density, GroundPrior, PlacementSearch};
 use super::tracklet::{SceneMotion, TimedFix, TrackPoint, Tracklet};
 use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
@@ -17,7 +18,7 @@ const MODEL: EvidenceModel = EvidenceModel {
         variance_m2: 6.8,
         correlation: NoiseCorrelation { white_share: 0.083, time_constant_s: 30.0 },
     },
-    motion: SceneMotion { spread_m: 6.0, speed_m_s: 0.8 },
+    motion: SceneMotion { spread_m: 6.0, speed_m_s: 0.8, speeds_m_s: [0.8; 3] },
 };
 
 const GROUND: GroundPrior = GroundPrior { map_sigma_m: 1.0, scale_sigma: 0.06, density: Density::Fixes };
@@ -69,6 +70,7 @@ fn the_recursive_ratio_is_that_of_the_dense_covariance() {
         let dense = PlacementSearch::new(
             std::slice::from_ref(&track),
             std::slice::from_ref(&fixes),
+            &[(0.0, 0.0)],
             &MODEL,
             &GroundPrior { map_sigma_m: 0.5, ..GROUND },
             0.0,
@@ -157,6 +159,17 @@ fn sampled_probabilities_are_those_of_the_enumeration() {
 /// Largest error, m, of the middle of four walks in the best placement of a ground that is turned by 70 degrees, 100 m
 /// away, and so much smaller; three of the walkers carry receivers, and there are some others at anchor.
 fn largest_error_m(prior: &GroundPrior, scale: f64, anchored: u8) -> f64 {
+    error_with_clocks_m(prior, scale, anchored, 0.0, 0.0)
+}
+
+/// The same with receivers' clocks that are late, and a window in which their offsets are searched, s.
+fn error_with_clocks_m(
+    prior: &GroundPrior,
+    scale: f64,
+    anchored: u8,
+    late_s: f64,
+    clock_window_s: f64,
+) -> f64 {
     let tracks =
         [walk([0.0, 0.0], 1.5), walk([8.0, -3.0], -1.0), walk([-4.0, 9.0], 2.5), walk([3.0, 5.0], 4.0)];
     let (sin, cos) = 70.0_f64.to_radians().sin_cos();
@@ -176,7 +189,9 @@ fn largest_error_m(prior: &GroundPrior, scale: f64, anchored: u8) -> f64 {
     let ground: Vec<Tracklet> = tracks.iter().map(seen).collect();
     let mut receivers: Vec<Vec<TimedFix>> = (0..3).map(|at| carried(&tracks[at], 20 + at as u64)).collect();
     receivers.extend((0..anchored).map(at_anchor));
-    let search = PlacementSearch::new(&ground, &receivers, &MODEL, prior, 0.0);
+    receivers.iter_mut().flatten().for_each(|fix| fix.time_s += late_s);
+    let settings = MatchSettings { clock_window_s, ..MatchSettings::default() };
+    let search = PlacementSearch::new(&ground, &receivers, &clock_grid(&settings), &MODEL, prior, 0.0);
     let best = search.search(1, 50.0, Cancellation::NEVER)[0];
     let error_m = |(track, ground): (&Tracklet, &Tracklet)| {
         let (truth, point) = (track.points[60].position, ground.points[60].position);
@@ -190,6 +205,12 @@ fn largest_error_m(prior: &GroundPrior, scale: f64, anchored: u8) -> f64 {
 fn place_and_direction_are_found_by_fixes_of_unknown_carriers() {
     let error_m = largest_error_m(&GROUND, 1.0, 0);
     assert!(error_m < 5.0, "{error_m}");
+}
+
+#[test]
+fn a_clock_window_allows_for_late_clocks() {
+    let [without_m, with_m] = [0.0, 10.0].map(|window_s| error_with_clocks_m(&GROUND, 1.0, 0, 8.0, window_s));
+    assert!(with_m < 5.0 && without_m > with_m + 1.0, "{without_m} {with_m}");
 }
 
 #[test]

@@ -115,13 +115,17 @@ pub(super) struct SceneMotion {
     pub(super) spread_m: f64,
     /// Root mean square of their speed per axis, m/s.
     pub(super) speed_m_s: f64,
+    /// The same of slow, usual and fast targets, m/s: each stands for as many of them.
+    pub(super) speeds_m_s: [f64; 3],
 }
 
 impl SceneMotion {
     /// Time over which a speed is measured, s: longer than the noise of boxes matters.
     const BASELINE_S: f64 = 2.0;
+    /// The same of who stands: people sway.
+    const LEAST_SPEED_M_S: f64 = 0.05;
 
-    /// Of the targets that the tracklets show.
+    /// Returns the motion of the targets that the tracklets show.
     #[must_use]
     pub(super) fn of(tracklets: &[Tracklet]) -> Self {
         let points = || tracklets.iter().flat_map(|tracklet| &tracklet.points);
@@ -132,20 +136,34 @@ impl SceneMotion {
             points().map(|point| (of(point) - centre).powi(2)).sum::<f64>() / count
         };
         let spread = variance(|point| point.position.east_m) + variance(|point| point.position.north_m);
-        let (mut squares, mut steps) = (0.0, 0.0);
-        for tracklet in tracklets {
-            let mut from = 0;
-            for (at, point) in tracklet.points.iter().enumerate() {
-                let first = &tracklet.points[from];
-                let elapsed_s = point.time_s - first.time_s;
-                if elapsed_s >= Self::BASELINE_S {
-                    squares += (point.position.distance_m(first.position) / elapsed_s).powi(2);
-                    steps += 1.0;
-                    from = at;
-                }
+        let mut squares: Vec<Vec<f64>> = tracklets.iter().map(Self::squared_speeds_m2_s2).collect();
+        squares.retain(|own| !own.is_empty());
+        let per_axis = |squares: &mut dyn Iterator<Item = f64>| {
+            let (sum, count) = squares.fold((0.0, 0.0), |(sum, count), square| (sum + square, count + 1.0));
+            if count > 0.0 { (0.5 * sum / count).sqrt() } else { 0.0 }
+        };
+        let mut speeds: Vec<f64> = squares.iter().map(|own| per_axis(&mut own.iter().copied())).collect();
+        speeds.sort_by(f64::total_cmp);
+        let quantile = |sixth: usize| speeds.get(speeds.len() * sixth / 6).copied().unwrap_or(0.0);
+        let speed_m_s = per_axis(&mut squares.iter().flatten().copied());
+        Self {
+            spread_m: (0.5 * spread).sqrt().max(3.0),
+            speed_m_s: speed_m_s.max(0.3),
+            speeds_m_s: [1, 3, 5].map(|sixth| quantile(sixth).max(Self::LEAST_SPEED_M_S)),
+        }
+    }
+
+    /// Squares of a target's speeds over [`Self::BASELINE_S`], m2/s2.
+    fn squared_speeds_m2_s2(tracklet: &Tracklet) -> Vec<f64> {
+        let (mut from, mut squares) = (0, Vec::new());
+        for (at, point) in tracklet.points.iter().enumerate() {
+            let first = &tracklet.points[from];
+            let elapsed_s = point.time_s - first.time_s;
+            if elapsed_s >= Self::BASELINE_S {
+                squares.push((point.position.distance_m(first.position) / elapsed_s).powi(2));
+                from = at;
             }
         }
-        let speed_m_s = if steps > 0.0 { (0.5 * squares / steps).sqrt() } else { 0.0 };
-        Self { spread_m: (0.5 * spread).sqrt().max(3.0), speed_m_s: speed_m_s.max(0.3) }
+        squares
     }
 }

@@ -83,7 +83,7 @@ impl OpenBlock {
         self.latest
     }
 
-    /// Whether a sample of that time belongs to the next block.
+    /// True if a sample of that time belongs to the next block.
     pub(super) fn is_complete(&self, time: Timestamp, settings: &DriftDetectorSettings) -> bool {
         let elapsed_s = |since: Timestamp| time.duration_since(since).as_secs_f64();
         elapsed_s(self.latest) > settings.gap_s || elapsed_s(self.began_at) >= settings.block_s

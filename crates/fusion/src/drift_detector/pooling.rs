@@ -17,7 +17,7 @@ use crate::domain::TargetId;
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct SpatialCoverage {
     pub(super) cells: u32,
-    /// Of those, the ones not covered before the onset.
+    /// Number of those that were not covered before the onset.
     pub(super) new_cells: u32,
 }
 
@@ -48,7 +48,7 @@ struct TargetAccumulator {
     blocks: WeightedSum,
     bias_m2: f64,
     epochs: IndependentEpochs,
-    /// What is included in [`PooledBlocks::total`].
+    /// The contribution to [`PooledBlocks::total`].
     contribution: WeightedSum,
 }
 

@@ -1,7 +1,7 @@
 //! Interpolates the regressed positions of one target to the times of its fixes, where boxes and fixes
 //! come at different instants.
 //!
-//! Never here: interpolation across a gap, or a second sample for the same fix.
+//! Does not interpolate across a gap, and does not give a second sample for the same fix.
 
 use std::collections::VecDeque;
 

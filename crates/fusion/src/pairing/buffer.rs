@@ -33,7 +33,7 @@ pub(super) struct Buffered<I, T> {
     /// Tags of items of the same source and instant that came after this one.
     duplicates: Vec<T>,
     is_paired: bool,
-    /// Of a box: its nearest fix is nearer to another box.
+    /// True for a box whose nearest fix is nearer to another box.
     is_fix_claimed: bool,
 }
 

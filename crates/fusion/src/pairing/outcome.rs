@@ -1,8 +1,8 @@
-//! What became of the items of a stream.
+//! The outcomes of the items of a stream.
 
 use crate::domain::{Detection, Sample};
 
-/// What became of an item.
+/// The outcome of an item.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum ItemOutcome {
     /// It is part of a sample.
@@ -18,20 +18,20 @@ pub enum ItemOutcome {
 /// An item that no later decision looks at, by the tag that it was pushed with.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Released<T> {
-    /// Which.
+    /// The tag that the item was pushed with.
     pub tag: T,
-    /// What became of it.
+    /// The item's outcome.
     pub outcome: ItemOutcome,
 }
 
-/// What one push has decided. A sample never comes after the release of its items.
+/// The decisions of one push. A sample never comes after the release of its items.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PairedItems<T> {
     /// New samples, per target in order of time.
     pub samples: Vec<Sample>,
     /// Boxes released without a partner, per target in order of time.
     pub unpaired_detections: Vec<Detection>,
-    /// Items released.
+    /// The items that were released.
     pub released: Vec<Released<T>>,
 }
 
@@ -42,7 +42,7 @@ impl<T> Default for PairedItems<T> {
 }
 
 impl<T> PairedItems<T> {
-    /// Whether nothing was decided.
+    /// True if nothing was decided.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.samples.is_empty() && self.released.is_empty()

@@ -35,7 +35,7 @@ impl<T> Pairer<T> {
         Self { settings, targets: BTreeMap::new(), pushes: 0, unpaired }
     }
 
-    /// What has not become part of a sample so far.
+    /// Returns the counts of items that have not become part of a sample so far.
     #[must_use]
     pub const fn unpaired(&self) -> Unpaired {
         self.unpaired

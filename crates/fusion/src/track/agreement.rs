@@ -1,16 +1,18 @@
-//! Whether the boxes and the fixes of a target agree, over longer than one instant.
+//! The agreement of the boxes and the fixes of a target, over longer than one instant.
 //!
 //! Each fix is paired with the box of its instant. Of the pairs' differences (fix less box) running means are kept: in
 //! metres, in standard deviations of the stated errors, and the share beyond the gate of a single pair. Errors that
 //! last longer than the mean do not average out, so a mean of n pairs has the variance `c + (1 - c) / n`, with c the
 //! share of such errors. Beside it each source is held against the motion of a target: it may not jump, nor stand
-//! still to the last digit. Never here: estimates, the filter's own state.
+//! still to the last digit. Where no source moves like a target, the stated radius follows from how far their positions
+//! miss the predicted ones. Does not contain estimates or
+//! the filter's own state.
 
 use jiff::Timestamp;
 
 use super::measurement::{MeasuredPosition, Measurement, MeasurementSource, RejectionReason};
 use super::settings::TrackSettings;
-use crate::geo::EastNorth;
+use crate::geo::{EastNorth, PlaneCovariance};
 use crate::statistics::{CHI_SQUARE_95, CHI_SQUARE_99_9, ONE_SIDED_95};
 
 /// Time constant of the running means, s.
@@ -27,6 +29,10 @@ const LARGEST_SIGMAS: f64 = 6.0;
 /// A position that is the same to the last digit for this long, s, may be that of a target that stands still, but not
 /// of one that the other source sees moving.
 const REPEATED_S: f64 = 3.0;
+/// Share of time in which a source's positions are not those of a target, from which on the stated radius grows to that
+/// of their misses, and where it has reached it.
+const SCATTERS_FROM: f64 = 0.5;
+const SCATTERS_AT: f64 = 0.75;
 
 /// The agreement of boxes and fixes so far: a plain value, part of the filter.
 #[derive(Debug, Clone, Copy, Default)]
@@ -44,6 +50,21 @@ struct SourceMotion {
     latest: Option<(Timestamp, MeasuredPosition)>,
     /// Running share of time in which its positions are not those of a target.
     implausible: f64,
+    /// The same of those whose stated error rests on nothing of training.
+    doubtful: f64,
+    /// The same of those that jump away from where they are expected, or say no more than that a target is in view.
+    scattered: f64,
+    /// Running mean of the stated covariances and of the squared distances from the predicted positions, m2 (covariance
+    /// matching; Mehra 1970).
+    missed: PlaneCovariance,
+}
+
+/// Where the filter expects a target at an instant.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Expected {
+    pub(super) position: EastNorth,
+    /// The largest speed that the target may have, m/s.
+    pub(super) speed_m_s: f64,
 }
 
 /// Running means over pairs.
@@ -67,10 +88,10 @@ struct Pairs {
     contradicting: f64,
 }
 
-/// What boxes and fixes together say.
+/// The verdict on boxes and fixes together.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Verdict {
-    /// Whether they differ by more than chance explains.
+    /// True if they differ by more than chance explains.
     pub(super) disagrees: bool,
     /// The source that is not to be used, and why: its positions are not those of a moving target where they differ from
     /// the other's, or its boxes are frozen.
@@ -85,8 +106,13 @@ impl Verdict {
 }
 
 impl Agreement {
-    /// Takes in what was measured at an instant. `speed_m_s` is the largest speed that the target may have.
-    pub(super) fn observe(&mut self, settings: &TrackSettings, measurement: &Measurement, speed_m_s: f64) {
+    /// Takes in what was measured at an instant.
+    pub(super) fn observe(
+        &mut self,
+        settings: &TrackSettings,
+        measurement: &Measurement,
+        expected: Expected,
+    ) {
         let Measurement { time, fix, regressed } = *measurement;
         if let Some(regressed) = regressed {
             self.is_frozen = regressed.repeated_s >= settings.frozen_after_s;
@@ -94,7 +120,7 @@ impl Agreement {
         for (source, measured) in [(MeasurementSource::Regressed, regressed), (MeasurementSource::Fix, fix)] {
             if let Some(measured) = measured {
                 let white_share = settings.white_share(source);
-                self.motions[source as usize].observe(time, measured, white_share, speed_m_s);
+                self.motions[source as usize].observe(time, measured, white_share, expected);
             }
         }
         self.forget(time);
@@ -104,7 +130,7 @@ impl Agreement {
         };
         let apart_s = time.duration_since(box_at).as_secs_f64();
         if (0.0..=PAIR_S).contains(&apart_s) {
-            let pair = Pair::new(settings, regressed, fix, speed_m_s * apart_s);
+            let pair = Pair::new(settings, regressed, fix, expected.speed_m_s * apart_s);
             match &mut self.pairs {
                 Some(pairs) => pairs.add(time, &pair),
                 none => *none = Some(Pairs::new(time, &pair)),
@@ -113,22 +139,46 @@ impl Agreement {
         }
     }
 
-    /// What is known so far.
+    /// Returns the verdict so far.
     #[inline]
     pub(super) fn verdict(&self) -> Verdict {
         let [by_box, by_fix] = self.motions.map(|motion| motion.implausible > 0.5);
-        let refuted = match (self.disagrees, by_box, by_fix) {
+        // Fixes that are beside such boxes tell more, even where a vague box does not contradict them.
+        let scatters =
+            self.pairs.is_some() && self.motions[MeasurementSource::Regressed as usize].scattered > 0.5;
+        let refuted = match (self.disagrees || scatters, by_box, by_fix) {
             _ if self.is_frozen => Some((MeasurementSource::Regressed, RejectionReason::Frozen)),
             (true, true, false) => Some((MeasurementSource::Regressed, RejectionReason::Implausible)),
             (true, false, true) => Some((MeasurementSource::Fix, RejectionReason::Implausible)),
+            // The target is in view, and the fixes are of no place there.
+            (true, true, true) if self.motions[MeasurementSource::Fix as usize].doubtful > 0.5 => {
+                Some((MeasurementSource::Fix, RejectionReason::Implausible))
+            }
             _ => None,
         };
         Verdict { disagrees: self.disagrees, refuted }
     }
 
+    /// The 95 % radius, m, at an instant, of an estimate that has `r95_m` if its sources are those of a target.
+    pub(super) fn radius_m(&self, now: Timestamp, r95_m: f64) -> f64 {
+        let either_m = self.radius_of_either_m(r95_m);
+        let verdict = self.verdict();
+        let in_use =
+            [MeasurementSource::Regressed, MeasurementSource::Fix].into_iter().filter_map(|source| {
+                let motion = &self.motions[source as usize];
+                let (at, _) = motion.latest.filter(|_| verdict.refutes(source).is_none())?;
+                (elapsed_s(at, now) <= FORGET_S).then_some(motion)
+            });
+        let (share, missed_m) = in_use.fold((1.0_f64, 0.0_f64), |(share, missed_m), motion| {
+            let own = (motion.implausible - SCATTERS_FROM) / (SCATTERS_AT - SCATTERS_FROM);
+            (share.min(own.clamp(0.0, 1.0)), missed_m.max(motion.missed.r95_m()))
+        });
+        either_m + share * (missed_m - either_m).max(0.0)
+    }
+
     /// The least 95 % radius, m, about a position between box and fix that holds the truth whichever of them is right,
     /// `r95_m` being that of the position if they agree. It grows from there as they cease to.
-    pub(super) fn radius_m(&self, r95_m: f64) -> f64 {
+    fn radius_of_either_m(&self, r95_m: f64) -> f64 {
         let Some(pairs) = self.pairs.filter(|_| self.verdict().refuted.is_none()) else { return r95_m };
         let [east_m, north_m] = pairs.mean_m;
         let apart_m =
@@ -159,9 +209,21 @@ impl Agreement {
 }
 
 impl SourceMotion {
-    fn observe(&mut self, time: Timestamp, measured: MeasuredPosition, white_share: f64, speed_m_s: f64) {
+    fn observe(
+        &mut self,
+        time: Timestamp,
+        measured: MeasuredPosition,
+        white_share: f64,
+        Expected { position, speed_m_s }: Expected,
+    ) {
+        let miss = measured.position.minus(position);
+        let miss = PlaneCovariance::outer(miss.east_m, miss.north_m);
+        let missed = measured.covariance.scaled(measured.stated_scale).plus(miss);
+        let as_share = |is_so: bool| f64::from(u8::from(is_so));
+        let doubtful = as_share(measured.is_doubtful);
         let Some((before, latest)) = self.latest.replace((time, measured)) else {
-            self.implausible = f64::from(u8::from(measured.is_doubtful));
+            let scattered = as_share(measured.is_vague);
+            *self = Self { implausible: doubtful, doubtful, scattered, missed, ..*self };
             return;
         };
         let step_s = elapsed_s(before, time);
@@ -172,7 +234,12 @@ impl SourceMotion {
         let jumps = measured.position.distance_m(latest.position) > noise_m + speed_m_s * step_s;
         let is_implausible = jumps || measured.is_doubtful || measured.repeated_s >= REPEATED_S;
         let weight = 1.0 - (-step_s.max(0.0) / MEMORY_S).exp();
-        self.implausible += weight * (f64::from(u8::from(is_implausible)) - self.implausible);
+        self.implausible += weight * (as_share(is_implausible) - self.implausible);
+        // After a single false position the next one jumps back to where it is expected.
+        let is_astray = jumps && measured.position.distance_m(position) > noise_m + speed_m_s * step_s;
+        self.scattered += weight * (as_share(is_astray || measured.is_vague) - self.scattered);
+        self.doubtful += weight * (doubtful - self.doubtful);
+        self.missed = self.missed.scaled(1.0 - weight).plus(missed.scaled(weight));
     }
 }
 

@@ -17,9 +17,9 @@ const LARGEST_RATIO: f64 = 1.5;
 /// the filter would take that for knowledge of c, as large as `dz / dL`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CameraError {
-    /// Of the bias, m2; `None` before the first box.
+    /// Covariance of the bias, m2; `None` before the first box.
     bias: Option<PlaneCovariance>,
-    /// Of the latest box ([`MeasuredPosition::stated_scale`]).
+    /// The stated scale of the latest box ([`MeasuredPosition::stated_scale`]).
     pub(super) stated_scale: f64,
     /// Distance travelled since that box, m.
     travelled_m: f64,

@@ -24,12 +24,12 @@ pub(super) struct GateOutcome {
     pub(super) innovation: EastNorth,
     pub(super) nis: f64,
     pub(super) rejected: Option<RejectionReason>,
-    /// Whether the position reinitialised the filter.
+    /// True if the position reinitialised the filter.
     pub(super) reinitialized: bool,
 }
 
 impl GateOutcome {
-    /// Of a position that is used, before its innovation is known.
+    /// The outcome of a position that is used, before its innovation is known.
     pub(super) const fn of(source: MeasurementSource) -> Self {
         Self {
             source,
@@ -40,7 +40,7 @@ impl GateOutcome {
         }
     }
 
-    /// Of a position that is not used.
+    /// The outcome of a position that is not used.
     pub(super) const fn unused(source: MeasurementSource, reason: RejectionReason) -> Self {
         Self { rejected: Some(reason), ..Self::of(source) }
     }

@@ -2,11 +2,11 @@
 //! and Kirubarajan 2001, 11.6.6): one [`ModeFilter`] per motion mode, their mixing, and the gate.
 //!
 //! Motion modes: stationary, steady (slowly varying velocity), agile (turning or starting).
-//! Never here: history, time to live, out-of-sequence measurements ([`super::Track`]).
+//! Does not contain history, time to live, or out-of-sequence measurements ([`super::Track`]).
 
 use jiff::Timestamp;
 
-use super::agreement::Agreement;
+use super::agreement::{Agreement, Expected};
 use super::camera_error::CameraError;
 use super::gate::{ACTIVE_S, GateOutcome, Reach, Reacquisition, SourceHistory};
 use super::measurement::{MeasuredPosition, Measurement, MeasurementSource, RejectionReason};
@@ -44,7 +44,7 @@ pub(super) struct ImmFilter {
     last_regressed_at: Option<Timestamp>,
     camera: CameraError,
     agreement: Agreement,
-    /// Whether the filter is to restart from the next fix, as what the boxes have told it is void.
+    /// True if the filter is to restart from the next fix, as what the boxes have told it is void.
     awaits_fix: bool,
     /// Square of the highest speed observed with confidence, decaying, m2/s2.
     speed_envelope_m2_s2: f64,
@@ -86,8 +86,10 @@ impl ImmFilter {
     /// Holds boxes and fixes against each other.
     pub(super) fn compare(&mut self, settings: &TrackSettings, measurement: &Measurement) {
         let used_boxes = self.agreement.verdict().refutes(MeasurementSource::Regressed).is_none();
+        let [east_m, north_m] = [POSITION, POSITION + 1].map(|state| self.mean_of(state));
         let speed_m_s = LARGEST_SPEED_RATIO * self.speed_envelope_m2_s2.sqrt();
-        self.agreement.observe(settings, measurement, speed_m_s);
+        let expected = Expected { position: EastNorth { east_m, north_m }, speed_m_s };
+        self.agreement.observe(settings, measurement, expected);
         let uses_boxes = self.agreement.verdict().refutes(MeasurementSource::Regressed).is_none();
         self.awaits_fix = !uses_boxes && (self.awaits_fix || used_boxes);
     }
@@ -168,10 +170,12 @@ impl ImmFilter {
 
     /// Speed of the mixture's mean velocity, m/s.
     fn mean_speed_m_s(&self) -> f64 {
-        let mean = |state: usize| -> f64 {
-            self.modes.iter().zip(self.mode_probabilities).map(|(mode, share)| share * mode.mean[state]).sum()
-        };
-        mean(VELOCITY).hypot(mean(VELOCITY + 1))
+        self.mean_of(VELOCITY).hypot(self.mean_of(VELOCITY + 1))
+    }
+
+    /// Mean of a state component over the modes.
+    fn mean_of(&self, state: usize) -> f64 {
+        self.modes.iter().zip(self.mode_probabilities).map(|(mode, share)| share * mode.mean[state]).sum()
     }
 
     /// Propagates to the measurement's instant and processes its positions, the regressed one first.
@@ -188,6 +192,9 @@ impl ImmFilter {
         let regressed = measurement.regressed.map(|measured| {
             if let Some(reason) = verdict.refutes(MeasurementSource::Regressed) {
                 return GateOutcome::unused(MeasurementSource::Regressed, reason);
+            }
+            if measured.is_vague {
+                return GateOutcome::unused(MeasurementSource::Regressed, RejectionReason::UnusableVariance);
             }
             let measured = self.camera.at_place(settings, measured);
             let correlation = self.camera.correlation(settings, &measured);
@@ -301,8 +308,10 @@ impl ImmFilter {
         let reach = self.reach(settings, decomposition);
         let history = &mut self.histories[source as usize];
         // A fix of 30 m passes the gate of a track that has lost its target, too, and would keep it for long.
-        let is_another =
-            history.agree_on(now, measured.position, reach) && (!other_is_active || is_confirmed);
+        // Positions that are the same to the last digit are one observation: those of a frozen picture agree, too.
+        let is_another = measured.repeated_s == 0.0
+            && history.agree_on(now, measured.position, reach)
+            && (!other_is_active || is_confirmed);
         let rejected_s = history.record_rejection(now, settings.reacquire_after_s);
         if is_another {
             self.restart(settings, source, measured);
@@ -421,7 +430,7 @@ impl ImmFilter {
             velocity: Velocity { east_m_s, north_m_s },
             covariance,
             velocity_covariance,
-            r95_m: self.agreement.radius_m(covariance.r95_m()),
+            r95_m: self.agreement.radius_m(self.time, covariance.r95_m()),
             stationary_probability: self.mode_probabilities[STATIONARY],
             nis: None,
             innovations: Vec::new(),
@@ -434,8 +443,7 @@ impl ImmFilter {
     /// Mean and stated covariance of a pair of components, position or velocity, over the modes.
     fn moments(&self, pair: usize) -> ([f64; 2], PlaneCovariance) {
         let modes = || self.modes.iter().zip(self.mode_probabilities);
-        let mean = [pair, pair + 1]
-            .map(|state| modes().map(|(mode, probability)| probability * mode.mean[state]).sum::<f64>());
+        let mean = [pair, pair + 1].map(|state| self.mean_of(state));
         let (mut covariance, mut lasting) = (PlaneCovariance::default(), PlaneCovariance::default());
         for (mode, probability) in modes() {
             let deviation = PlaneCovariance::outer(mode.mean[pair] - mean[0], mode.mean[pair + 1] - mean[1]);
@@ -453,7 +461,7 @@ impl ImmFilter {
     }
 }
 
-/// Whether a regressed position and a fix of one instant pass each other's gate.
+/// True if a regressed position and a fix of one instant pass each other's gate.
 fn agree(settings: &TrackSettings, regressed: MeasuredPosition, fix: MeasuredPosition) -> bool {
     let covariance = fix.covariance.plus(regressed.covariance.scaled(regressed.stated_scale));
     fix.covariance.is_positive()

@@ -13,7 +13,7 @@ pub struct MeasuredPosition {
     pub position: EastNorth,
     /// Covariance R of the total error, white part and bias together, m2.
     pub covariance: PlaneCovariance,
-    /// Of it, the white part, m2; `None` for the share of the track's settings.
+    /// The white part of the covariance, m2; `None` for the share of the track's settings.
     pub white: Option<PlaneCovariance>,
     /// Factor of the normal distribution that has the stated 95 % radius, at least 1 where the covariance is itself
     /// uncertain. It widens the gate and what the track states, not the weight of the source: the variance that is
@@ -21,8 +21,11 @@ pub struct MeasuredPosition {
     pub stated_scale: f64,
     /// For how long this source's positions have been the same to the last digit, s.
     pub repeated_s: f64,
-    /// Whether its stated error rests on nothing of training: a box unlike those, a fix far from the scene.
+    /// True if its stated error rests on nothing of training: a box unlike those, a fix far from the scene.
     pub is_doubtful: bool,
+    /// True if its error is as large as the scene, so that it says no more than that a target is in view: it updates no
+    /// estimate.
+    pub is_vague: bool,
 }
 
 impl MeasuredPosition {
@@ -36,11 +39,12 @@ impl MeasuredPosition {
             stated_scale: 1.0,
             repeated_s: 0.0,
             is_doubtful: false,
+            is_vague: false,
         }
     }
 }
 
-/// What was measured at one instant: a fix, a regressed position, or both.
+/// The measurement of one instant: a fix, a regressed position, or both.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Measurement {
     /// Time of measurement, by the camera's clock.

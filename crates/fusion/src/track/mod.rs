@@ -6,7 +6,7 @@
 //! Measurements beyond the chi-square gate are rejected with a reason; a rejection is part of the
 //! answer, not an error. Out-of-sequence measurements within the window are inserted at their time
 //! and the filter is replayed from the last checkpoint before them, so the order of arrival does
-//! not change the state by a single bit. Never here: clocks, I/O, pixels, degrees.
+//! not change the state by a single bit. Does not use clocks, I/O, pixels or degrees.
 
 mod agreement;
 mod camera_error;
@@ -88,7 +88,7 @@ impl Track {
         self.current.time
     }
 
-    /// Whether the target has not been measured for longer than `time_to_live_s`.
+    /// True if the target has not been measured for longer than `time_to_live_s`.
     #[must_use]
     pub fn is_expired(&self, at: Timestamp) -> bool {
         at.duration_since(self.current.time).as_secs_f64() > self.settings.time_to_live_s

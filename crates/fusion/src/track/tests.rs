@@ -375,6 +375,27 @@ fn boxes_that_the_fixes_confirm_are_followed_and_others_are_not() {
 }
 
 #[test]
+fn false_boxes_leave_a_radius_that_holds() {
+    // A detector of anything: a tenth of its boxes looks like a target, at a place that has nothing to do with that of the
+    // target, the origin. The others say that they know no more than the scene.
+    let mut random = stream(31, 0);
+    let mut next = |second: u32| {
+        let [east_m, north_m] = [0, 1].map(|_| 20.0 * standard_normal(&mut random));
+        let sure = MeasuredPosition::isotropic(EastNorth { east_m, north_m }, 1.0);
+        let covariance = PlaneCovariance::isotropic(400.0);
+        let vague = MeasuredPosition { is_vague: true, is_doubtful: true, covariance, ..sure };
+        let regressed = Some(if second.is_multiple_of(10) { sure } else { vague });
+        Measurement { time: at_s(f64::from(second)), fix: None, regressed }
+    };
+    let mut track = Track::start(TrackSettings::default(), &next(0)).expect("a box");
+    let states: Vec<_> = (1..400).map(|second| track.update(&next(second))).collect();
+    let settled = &states[20..];
+    let inside = settled.iter().filter(|it| it.position.distance_m(EastNorth::default()) <= it.r95_m);
+    let share = inside.count() as f64 / settled.len() as f64;
+    assert!(share >= 0.88, "{share}");
+}
+
+#[test]
 fn a_single_source_that_contradicts_the_track_reinitialises_it() {
     let mut track = Track::start(TrackSettings::default(), &fix_at(0.0, 0.0, 4.0)).expect("a fix");
     for second in 1..30 {

@@ -29,7 +29,7 @@ pub(super) struct PredictedTrack<'a> {
     frame: &'a CameraFrame,
     /// The id that the camera's tracker gave the target last.
     tracker_id: Option<&'a TargetId>,
-    /// What is left of the camera's offset, and the share of the covariance of an unknown one that has come to it.
+    /// The decayed offset of the camera, and the share of the covariance of an unknown one that has come to it.
     offset: Option<(CameraOffset, f64)>,
     position: EastNorth,
     covariance_m2: PlaneCovariance,

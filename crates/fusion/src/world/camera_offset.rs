@@ -20,17 +20,16 @@ use crate::geo::{EastNorth, PlaneCovariance};
 pub(super) struct CameraOffset {
     /// m, east and north.
     pub(super) mean: EastNorth,
-    /// m2.
     pub(super) covariance_m2: PlaneCovariance,
 }
 
 impl CameraOffset {
-    /// Of a camera that has not seen the target: it differs from the track by the errors of both.
+    /// The offset of a camera that has not seen the target: it differs from the track by the errors of both.
     pub(super) fn unknown(own_m2: PlaneCovariance, of_track_m2: PlaneCovariance) -> Self {
         Self { mean: EastNorth::default(), covariance_m2: own_m2.plus(of_track_m2) }
     }
 
-    /// What is left of it after some seconds, and the share of the covariance of an unknown offset that has come to it.
+    /// Returns the offset after some seconds, and the share of the covariance of an unknown offset that has come to it.
     pub(super) fn decayed(self, seconds: f64, time_constant_s: f64) -> (Self, f64) {
         let decay = (-seconds.max(0.0) / time_constant_s).exp();
         let kept = decay * decay;

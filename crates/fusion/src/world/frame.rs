@@ -1,4 +1,4 @@
-//! What goes into a world tracker and what comes out of it.
+//! The input and the output of a world tracker.
 
 use std::fmt;
 
@@ -22,9 +22,9 @@ impl fmt::Display for WorldTrackId {
 pub struct CameraFrame {
     /// The camera.
     pub camera: CameraId,
-    /// When.
+    /// The instant of the frame.
     pub time: Timestamp,
-    /// What it saw; none is a frame too.
+    /// The detections; an empty frame counts too.
     pub detections: Vec<WorldDetection>,
 }
 
@@ -89,30 +89,30 @@ pub enum WorldEvent {
 /// A [`WorldEvent`] with the instant at which it was noticed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TimedEvent {
-    /// When.
+    /// The instant of the event.
     pub time: Timestamp,
-    /// What.
+    /// The event.
     pub event: WorldEvent,
 }
 
-/// What became of a frame.
+/// The outcome of a frame.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct FrameOutcome {
     /// The track of each detection, in their order; `None` for one that was not processed.
     pub tracks: Vec<Option<WorldTrackId>>,
     /// Detections beyond the bounds of the settings.
     pub dropped: usize,
-    /// Whether the whole frame was refused because it came too late.
+    /// True if the whole frame was refused because it came too late.
     pub too_late: bool,
-    /// What changed, in order.
+    /// The changes, in order.
     pub events: Vec<TimedEvent>,
 }
 
-/// What became of a fix.
+/// The outcome of a fix.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct FixOutcome {
     /// The track of the receiver.
     pub track: Option<WorldTrackId>,
-    /// What changed, in order.
+    /// The changes, in order.
     pub events: Vec<TimedEvent>,
 }

@@ -61,7 +61,7 @@ impl MergeCandidates {
     }
 }
 
-/// Whether the distance may be within the gate: a quick test before the exact one.
+/// True if the distance may be within the gate: a quick test before the exact one.
 fn is_near(one: &WorldTrack, other: &WorldTrack) -> bool {
     const FAR_M: f64 = 10.0;
     one.filter.position().distance_m(other.filter.position()) < FAR_M

@@ -5,7 +5,7 @@
 //! constant-velocity modes, and two tracks that turn out to be of one target are merged. The error of a detection has
 //! three parts: the noise of the box goes into the filter, what lasts of a camera's own error is a state per track and
 //! camera, and what all cameras have in common is added to the output only, for it does not average out.
-//! Never here: I/O, clocks, randomness, pixels, degrees.
+//! Does not use I/O, clocks, randomness, pixels or degrees.
 
 pub mod assignment;
 mod association_cost;

@@ -10,7 +10,7 @@ use crate::domain::{CameraId, ReceiverId, TargetId};
 use crate::domain::{Motion, Velocity};
 use crate::geo::{EastNorth, PlaneCovariance};
 
-/// Whether a track is reported.
+/// States if a track is reported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TrackStatus {
     /// Too few detections so far: it may be a false detection.
@@ -68,7 +68,7 @@ pub struct WorldTrack {
     pub(super) offset_covariance_m2: PlaneCovariance,
     /// Covariance of the error that the latest measurements have in common, m2.
     common_covariance_m2: PlaneCovariance,
-    /// Whether the latest measurement was a fix.
+    /// True if the latest measurement was a fix.
     measured_by_receiver: bool,
     pub(super) born: Timestamp,
     pub(super) last_seen: Timestamp,
@@ -175,7 +175,7 @@ impl WorldTrack {
         &self.sightings
     }
 
-    /// Whether the camera's tracker gave the track that number last.
+    /// True if the camera's tracker gave the track that number last.
     pub(super) fn has_tracker_id(&self, camera: &CameraId, tracker_id: Option<&TargetId>) -> bool {
         let sighting = self.sightings.iter().find(|sighting| sighting.camera == *camera);
         tracker_id.is_some() && sighting.is_some_and(|sighting| sighting.tracker_id.as_ref() == tracker_id)
@@ -187,7 +187,7 @@ impl WorldTrack {
         self.sightings.iter().filter(recent).map(|sighting| &sighting.camera)
     }
 
-    /// Whether it is reported, at the tracker's time.
+    /// Returns the track's status at the tracker's time.
     #[must_use]
     pub fn status(&self, now: Timestamp, settings: &WorldTrackSettings) -> TrackStatus {
         if !self.confirmed {
@@ -199,7 +199,7 @@ impl WorldTrack {
         }
     }
 
-    /// Whether it has been confirmed.
+    /// True if the track has been confirmed.
     #[must_use]
     pub const fn is_confirmed(&self) -> bool {
         self.confirmed
@@ -233,7 +233,7 @@ impl WorldTrack {
         }
     }
 
-    /// Whether its position is that of its receiver: no camera sees it.
+    /// True if its position is that of its receiver: no camera sees it.
     pub(super) const fn is_measured_by_receiver(&self) -> bool {
         self.measured_by_receiver
     }
@@ -315,7 +315,7 @@ impl WorldTrack {
         confirms
     }
 
-    /// Whether it ends without a measurement until now.
+    /// True if the track ends because it has had no measurement until now.
     pub(super) fn is_expired(&self, now: Timestamp, settings: &WorldTrackSettings) -> bool {
         let allowed_s = if !self.confirmed {
             settings.unconfirmed_coast_s

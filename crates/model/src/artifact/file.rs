@@ -1,7 +1,6 @@
 //! One file for one model version: safetensors, with the metadata document and a checksum in the header.
 //!
-//! A file that one server gives can be imported by another, and read by `sightfix fuse --model`. Files of
-//! earlier releases have no checksum.
+//! A file that one server gives can be imported by another, and read by `sightfix fuse --model`.
 
 use std::collections::HashMap;
 
@@ -61,11 +60,8 @@ impl Artifact {
         }
         let tensors = SafeTensors::deserialize(file).map_err(not_safetensors)?;
         let weights = safetensors::serialize(tensors.tensors(), None).map_err(not_safetensors)?;
-        if entries
-            .get(CHECKSUM_KEY)
-            .is_some_and(|sha256| *sha256 != model_sha256(document.as_bytes(), &weights))
-        {
-            let message = "does not match its checksum, so it was damaged on its way; download it again";
+        if entries.get(CHECKSUM_KEY) != Some(&model_sha256(document.as_bytes(), &weights)) {
+            let message = "has no checksum or another one than it states, so it was damaged on its way; download it again";
             return Err(Error::invalid("file", message));
         }
         let metadata = serde_json::from_str(document)

@@ -126,7 +126,7 @@ impl ModelParts {
         }
     }
 
-    /// A scalar of the recipe that earlier formats do not have.
+    /// A scalar that not all models of the recipe have.
     ///
     /// # Errors
     /// Names the parameter if it is present and not finite.

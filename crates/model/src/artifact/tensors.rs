@@ -16,7 +16,7 @@ pub const LARGEST_WEIGHTS_BYTES: usize = 64 * 1024;
 /// it come from a damaged or forged file and would overflow before they give a position.
 pub(crate) const LARGEST_MAGNITUDE: f64 = 1e12;
 
-/// Whether a number is finite and within [`LARGEST_MAGNITUDE`].
+/// True if a number is finite and within [`LARGEST_MAGNITUDE`].
 pub(crate) fn is_usable(value: f64) -> bool {
     value.abs() <= LARGEST_MAGNITUDE
 }
@@ -46,7 +46,7 @@ impl Tensors {
         self.0.insert(name.into(), Tensor { shape: shape.to_vec(), values: Values::F64(values) });
     }
 
-    /// Whether there is a tensor of that name.
+    /// True if there is a tensor of that name.
     pub(crate) fn holds(&self, name: &str) -> bool {
         self.0.contains_key(name)
     }

@@ -7,11 +7,11 @@ use crate::domain::{NoiseCorrelation, Result, SessionBias};
 /// Correlation of the errors of receiver and model, whose variances are stated elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackNoiseModel {
-    /// Of the receiver's error beside its bias of the session.
+    /// The noise of the receiver's error besides its bias of the session.
     pub gnss: NoiseCorrelation,
-    /// Of the receiver's error, the part that lasts for a session.
+    /// The part of the receiver's error that lasts for a session.
     pub gnss_session: SessionBias,
-    /// Of the model's error while the target is stationary.
+    /// The noise of the model's error while the target is stationary.
     pub regression: NoiseCorrelation,
     /// Distance over which the correlation of the model's error falls to 1/e, m.
     pub regression_length_m: f64,
@@ -21,17 +21,15 @@ pub struct TrackNoiseModel {
 /// target's motion, and fixes cannot distinguish smaller values.
 pub(crate) const LEAST_GNSS_WHITE_SHARE: f64 = 0.01;
 
-const NAMES: [&str; 5] = [
+const NAMES: [&str; 7] = [
     "track_gnss_white_share",
     "track_gnss_time_constant_s",
+    "track_gnss_session_share",
+    "track_gnss_session_time_constant_s",
     "track_regression_white_share",
     "track_regression_time_constant_s",
     "track_regression_length_m",
 ];
-
-/// Missing in models before they were estimated.
-const SESSION_SHARE: &str = "track_gnss_session_share";
-const SESSION_TIME: &str = "track_gnss_session_time_constant_s";
 
 impl TrackNoiseModel {
     /// Adds the scalars to the parts of a model.
@@ -39,6 +37,8 @@ impl TrackNoiseModel {
         let values = [
             self.gnss.white_share,
             self.gnss.time_constant_s,
+            self.gnss_session.share,
+            self.gnss_session.time_constant_s,
             self.regression.white_share,
             self.regression.time_constant_s,
             self.regression_length_m,
@@ -46,11 +46,9 @@ impl TrackNoiseModel {
         for (name, value) in NAMES.into_iter().zip(values) {
             parts.set(name, value);
         }
-        parts.set(SESSION_SHARE, self.gnss_session.share);
-        parts.set(SESSION_TIME, self.gnss_session.time_constant_s);
     }
 
-    /// The scalars of a model's metadata; `None` in an earlier format, which has none of them.
+    /// The scalars of a model's metadata; `None` before they are estimated.
     ///
     /// # Errors
     /// Names the parameter that is not finite or out of range, or missing although others are there.
@@ -58,15 +56,23 @@ impl TrackNoiseModel {
         if !NAMES.iter().any(|name| parts.parameters.contains_key(*name)) {
             return Ok(None);
         }
-        let [gnss_share, gnss_constant, regression_share, regression_constant, regression_length] = NAMES;
+        let [
+            gnss_share,
+            gnss_constant,
+            session_share,
+            session_constant,
+            regression_share,
+            regression_constant,
+            regression_length,
+        ] = NAMES;
         Ok(Some(Self {
             gnss: NoiseCorrelation {
                 white_share: parts.parameter(gnss_share)?.clamp(LEAST_GNSS_WHITE_SHARE, 1.0),
                 time_constant_s: parts.positive_parameter(gnss_constant)?,
             },
             gnss_session: SessionBias {
-                share: parts.parameter_or(SESSION_SHARE, 0.0)?.clamp(0.0, 1.0),
-                time_constant_s: session_time_constant_s(parts)?,
+                share: parts.parameter(session_share)?.clamp(0.0, 1.0),
+                time_constant_s: parts.positive_parameter(session_constant)?,
             },
             regression: NoiseCorrelation {
                 white_share: parts.parameter(regression_share)?.clamp(0.0, 1.0),
@@ -74,13 +80,5 @@ impl TrackNoiseModel {
             },
             regression_length_m: parts.positive_parameter(regression_length)?,
         }))
-    }
-}
-
-fn session_time_constant_s(parts: &ModelParts) -> Result<f64> {
-    if parts.parameters.contains_key(SESSION_TIME) {
-        parts.positive_parameter(SESSION_TIME)
-    } else {
-        Ok(SessionBias::DEFAULT_TIME_CONSTANT_S)
     }
 }

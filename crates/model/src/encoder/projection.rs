@@ -138,7 +138,7 @@ impl Projection {
         }
     }
 
-    /// Whether the foot point of a box lies below the horizon, on the image of the ground.
+    /// True if the foot point of a box lies below the horizon, on the image of the ground.
     #[must_use]
     pub fn is_below_horizon(&self, bounding_box: &BoundingBox) -> bool {
         self.at(bounding_box).denominator > LEAST_DENOMINATOR

@@ -40,7 +40,7 @@ const EXCLUDED_SIGMA: f64 = 1e-6;
 /// The terms that a fit may use.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Form {
-    /// Whether width and height are used besides the foot point.
+    /// True if width and height are used besides the foot point.
     pub(crate) uses_size: bool,
     /// Prior standard deviation of the weight of an extra column, in units of position.
     pub(crate) extra_sigma: f64,
@@ -184,7 +184,7 @@ fn prior(form: Form, columns: usize) -> Vec<f64> {
     sigmas.iter().map(|sigma| 1.0 / (sigma * sigma)).collect()
 }
 
-/// What does not change during a fit.
+/// The constants of a fit.
 struct LeastSquaresProblem<'a> {
     rows: &'a [TrainingRow],
     columns: &'a [Vec<f64>],

@@ -34,15 +34,13 @@ const LARGEST_RESIDUAL: f64 = 4.0;
 const WEIGHTS: LossWeights = LossWeights { reconstruction: 0.2, regression: 1.0 };
 /// Share of the labels on either side that the bounds of the positions ignore.
 const IGNORED_SHARE: usize = 100;
-/// Bound of the positions of models without bounds, in units of position.
-const UNBOUNDED: f64 = 1e9;
 
 /// The parts of the recipe that are used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Variant {
-    /// Whether the position depends on width and height besides the foot point.
+    /// True if the position depends on width and height besides the foot point.
     pub(crate) uses_size: bool,
-    /// Whether the hidden units of a network are added to the geometric map.
+    /// True if the hidden units of a network are added to the geometric map.
     pub(crate) residual: bool,
 }
 
@@ -274,13 +272,9 @@ impl ProjectiveEncoder {
     }
 }
 
-/// Bounds of the positions; an earlier format has none.
+/// Bounds of the positions.
 fn take_bounds(tensors: &mut Tensors) -> Result<[[f64; 2]; 2]> {
-    let bounds = if tensors.holds("bounds") {
-        tensors.take_f64("bounds", &[2, 2])?
-    } else {
-        vec![-UNBOUNDED, UNBOUNDED, -UNBOUNDED, UNBOUNDED]
-    };
+    let bounds = tensors.take_f64("bounds", &[2, 2])?;
     let bounds = [[bounds[0], bounds[1]], [bounds[2], bounds[3]]];
     if bounds.iter().any(|[low, high]| low > high) {
         return Err(Error::invalid("weights", "bounds must have the least before the greatest"));

@@ -16,7 +16,7 @@ pub(super) struct Candidate {
     /// Name in the model's report.
     pub(super) name: &'static str,
     pub(super) estimator: Estimator,
-    /// Whether the labels are smoothed by a kinematic smoother.
+    /// True if the labels are smoothed by a kinematic smoother.
     smoothed: bool,
 }
 
@@ -61,7 +61,7 @@ pub(super) const fn of_recipe(recipe: Recipe) -> &'static [Candidate] {
     }
 }
 
-/// What all fits of a run have in common.
+/// The context that all fits of a run share.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct FitContext<'a> {
     /// Error variance per axis of the receiver, m2.
@@ -99,7 +99,7 @@ impl FitContext<'_> {
 }
 
 impl Candidate {
-    /// Whether the labels are smoothed.
+    /// True if the labels are smoothed.
     pub(super) const fn is_smoothed(&self) -> bool {
         self.smoothed
     }

@@ -1,4 +1,4 @@
-//! What a run found out, in words: each candidate's held-out error, why it was kept or not, and what would
+//! The findings of a run, in words: each candidate's held-out error, why it was kept or not, and what would
 //! make the model surer.
 
 use super::candidates::Candidate;
@@ -13,7 +13,7 @@ use crate::statistics::{R95_PER_SIGMA, median};
 
 /// Below this share of held-out fixes inside the stated radius the report says so.
 const LEAST_COVERAGE: f64 = 0.9;
-/// Below so many traverses more of them help.
+/// Below this number of traverses more of them help.
 const FEW_TRAVERSES: u32 = 8;
 /// Sessions disagree if their bias per axis exceeds this share of the receiver's standard deviation.
 const DISAGREEMENT: f64 = 0.5;
@@ -37,7 +37,7 @@ pub(super) struct Selection<'a> {
     pub(super) chosen: usize,
 }
 
-/// What a model states of its own error over the training positions: 95 % radii of one box alone, m.
+/// The error that a model states of itself over the training positions: 95 % radii of one box alone, m.
 struct MapError {
     median_m: f64,
     worst_m: f64,
@@ -137,7 +137,7 @@ fn reason_to_drop(selection: &Selection<'_>, at: usize) -> String {
     }
 }
 
-/// What to do if the latitude and longitude of rows seem to be swapped.
+/// Advice for rows whose latitude and longitude seem to be swapped.
 fn swapped_columns(rows: &TrainingRows) -> Option<String> {
     const REMEDY: &str = "swap the two columns, import these samples again with on_conflict=replace (--replace), and train again";
     let centre = rows.plane.origin();
@@ -165,7 +165,7 @@ fn swapped_columns(rows: &TrainingRows) -> Option<String> {
     })
 }
 
-/// Whether the map is still the larger part of what the answers may be wrong by.
+/// Advice to record more walks while the map is still the larger part of the answers' error.
 fn more_walks(map_error: &MapError, parts: &ModelParts) -> Option<String> {
     let fix_m = R95_PER_SIGMA * parts.e_gnss_m2.sqrt();
     (map_error.median_m > SMALL_MAP_ERROR * fix_m).then(|| {

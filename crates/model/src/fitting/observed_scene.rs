@@ -1,5 +1,5 @@
-//! What training shows of the scene in view: where its targets are, and for how long one stands without a change of its
-//! box.
+//! The scene in view as training shows it: the positions of its targets, and how long one stands without a change
+//! of its box.
 
 use crate::artifact::ModelParts;
 use crate::domain::Sample;

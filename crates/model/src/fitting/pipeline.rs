@@ -37,7 +37,7 @@ pub(super) const MAX_ROWS: usize = 20_000;
 /// Least error variance of a receiver that is estimated, m2.
 pub(super) const LEAST_GNSS_VARIANCE_M2: f64 = 1e-4;
 
-/// What a fit learns from.
+/// The training input of a fit.
 #[derive(Debug, Clone, Copy)]
 pub struct FitInput<'a> {
     /// Boxes with the fix of the same instant.
@@ -59,7 +59,7 @@ impl<'a> From<&'a Vec<Sample>> for FitInput<'a> {
     }
 }
 
-/// What a fit is asked to do.
+/// The options of a fit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitOptions {
     /// The recipe.

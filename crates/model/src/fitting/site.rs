@@ -141,10 +141,10 @@ fn unusable(message: String) -> FitError {
     FitError::Unusable(Error::field(ErrorKind::UnusableSamples, "samples", message))
 }
 
-/// What is held out together: whole receivers; blocks of time where one receiver has nearly all fixes.
+/// The groups that are held out together: whole receivers; blocks of time where one receiver has nearly all fixes.
 struct Groups {
     count: u32,
-    /// By receiver.
+    /// Group of each row if whole receivers are held out.
     of_receiver: Option<Vec<usize>>,
     /// Times at which blocks after the first begin, s.
     cuts_s: Vec<f64>,
@@ -204,10 +204,10 @@ struct Validation {
     disagreement: [Mean; 2],
 }
 
-/// What the maps are fitted to besides the feet of boxes.
+/// The observations that the maps are fitted to besides the feet of boxes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum MapForm {
-    /// Nothing.
+    /// No other observations.
     Foot,
     /// The heights of boxes: cameras are upright, and targets of one kind are about equally tall.
     Upright,
@@ -226,7 +226,7 @@ impl MapForm {
 struct SiteFit<'a> {
     cameras: &'a [SiteCamera<'a>],
     rows: &'a [TrainingRows],
-    /// Of the joint fit.
+    /// The plane of the joint fit.
     plane: LocalPlane,
     groups: Groups,
     site: SiteRows<'a>,
@@ -293,7 +293,7 @@ impl SiteFit<'_> {
         })
     }
 
-    /// What the heights of boxes say, if the form uses it.
+    /// Returns the evidence of the heights of boxes, if the form uses it.
     fn upright_of(&self, form: MapForm) -> &[Option<UprightStarts>] {
         match form {
             MapForm::Foot => &[],

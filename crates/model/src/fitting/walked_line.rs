@@ -1,4 +1,4 @@
-//! Whether all walks of a training were on one line: what is beside it then rests on the geometry's prior.
+//! Test for a training whose walks were all on one line: positions beside it then rest on the geometry's prior.
 
 use nalgebra::{Matrix2, Matrix4, SymmetricEigen, Vector2, Vector4};
 
@@ -8,7 +8,7 @@ use crate::statistics::median;
 /// Standard deviation of the feet about one curve, in widths of a box, below which they are on a line.
 const NARROW_WIDTHS: f64 = 0.25;
 
-/// Whether the feet of the boxes lie on one smooth curve of the image: a cubic about their principal axis.
+/// True if the feet of the boxes lie on one smooth curve of the image: a cubic about their principal axis.
 pub(super) fn is_one_line(rows: &TrainingRows) -> bool {
     let feet: Vec<Vector2<f64>> = rows.rows.iter().map(|row| row.bounding_box.foot_px().into()).collect();
     let width_px = median(rows.rows.iter().map(|row| row.bounding_box.width_px()).collect());

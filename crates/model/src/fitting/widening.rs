@@ -1,4 +1,4 @@
-//! Whether the error that a recipe states holds on the targets that its fits had not seen.
+//! Check of the error that a recipe states, on the targets that its fits had not seen.
 
 use crate::artifact::ModelParts;
 use crate::domain::GaussMarkovNoise;

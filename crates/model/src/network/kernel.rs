@@ -35,7 +35,7 @@ impl TrainingSet {
         self.position_targets[0].len()
     }
 
-    /// Whether there are no samples.
+    /// True if there are no samples.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.position_targets[0].is_empty()
@@ -45,16 +45,16 @@ impl TrainingSet {
 /// wX and wZ of (1).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LossWeights {
-    /// Of the reconstruction error.
+    /// Weight of the reconstruction error.
     pub reconstruction: f32,
-    /// Of the regression error.
+    /// Weight of the regression error.
     pub regression: f32,
 }
 
 /// Sums over the samples of a batch or an epoch.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct LossSums {
-    /// Samples.
+    /// Number of samples.
     pub samples: f64,
     /// L of (1).
     pub loss: f64,
@@ -99,7 +99,7 @@ impl Scratch {
 pub(crate) struct BatchLoss<'a> {
     /// Shape of the network.
     pub shape: &'a NetShape,
-    /// Flat parameters.
+    /// The parameters, flat.
     pub parameters: &'a [f32],
     /// All samples.
     pub set: &'a TrainingSet,
@@ -107,7 +107,7 @@ pub(crate) struct BatchLoss<'a> {
     pub rows: &'a [u32],
     /// Weights of the two errors.
     pub weights: LossWeights,
-    /// Work space.
+    /// Memory for intermediate values.
     pub scratch: &'a mut Scratch,
     /// Receives the gradient of the batch's mean loss.
     pub gradient: &'a mut [f32],

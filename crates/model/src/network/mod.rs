@@ -4,10 +4,10 @@ mod forward;
 pub(crate) mod kernel;
 mod optimizer;
 mod shape;
-mod training;
+mod training_loop;
 
 pub use self::forward::Net;
 pub use self::kernel::{LossSums, LossWeights, TrainingSet};
 pub use self::optimizer::Schedule;
 pub use self::shape::{Activation, Layer, NetShape};
-pub use self::training::{TrainError, train};
+pub use self::training_loop::{TrainError, train};

@@ -76,7 +76,7 @@ impl NetShape {
         self.activation
     }
 
-    /// Whether there are layers after the bottleneck.
+    /// True if there are layers after the bottleneck.
     #[must_use]
     pub fn has_decoder(&self) -> bool {
         self.bottleneck + 1 < self.widths.len()
@@ -126,6 +126,6 @@ pub struct Layer {
     pub inputs: usize,
     /// Rows of the matrix.
     pub outputs: usize,
-    /// Whether the outputs are linear, without activation.
+    /// True if the outputs are linear, without activation.
     pub linear: bool,
 }

@@ -36,7 +36,7 @@ impl<'g> Boxes<'g> {
         [self.left, self.top, self.left + self.width, self.top + self.height]
     }
 
-    /// Whether the image's border truncates a box, as `BoundingBox::touches_border` has it: above 0 where it does.
+    /// Distance by which the image's border truncates a box, px: above 0 where `BoundingBox::touches_border` is true.
     pub(super) fn beyond_border_px(self, image_size: Option<ImageSize>) -> Expr<'g> {
         let near_px = 1.0;
         let [left, top, right, bottom] = self.edges();

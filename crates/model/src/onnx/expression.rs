@@ -34,7 +34,7 @@ enum Name {
     Node(usize),
 }
 
-/// Whether something holds, by element.
+/// A condition, by element.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Condition<'g>(Expr<'g>);
 

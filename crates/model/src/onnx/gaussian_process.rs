@@ -72,7 +72,7 @@ fn edges_px([u, v, width, height]: Sides<'_>) -> Sides<'_> {
     [u - width * 0.5, v - height, u + width * 0.5, v]
 }
 
-/// What all maps say of a box.
+/// The mixture of all maps for a box.
 struct Mixture<'g> {
     position_m: [Expr<'g>; 2],
     map_m2: Covariance<'g>,
@@ -104,7 +104,7 @@ fn mix<'g>(predictor: &Predictor, sides: Sides<'g>) -> Mixture<'g> {
     Mixture { position_m: [0, 1].map(|axis| origin_m[axis] + mean_m[axis]), map_m2, by_edge }
 }
 
-/// What one map says of a box.
+/// The terms of one map for a box.
 struct MapTerms<'g> {
     tangent: [Expr<'g>; 2],
     /// In the directions of the kernel's weights; missing without a kernel.

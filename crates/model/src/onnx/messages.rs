@@ -109,7 +109,6 @@ pub(super) struct TypeProto {
     pub(super) tensor_type: Option<TensorTypeProto>,
 }
 
-/// `TypeProto.Tensor`.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct TensorTypeProto {
     #[prost(int32, tag = "1")]

@@ -196,7 +196,7 @@ fn value_info(name: &str, columns: i64, text: &str) -> ValueInfoProto {
     }
 }
 
-/// What a user of the graph has to know beside its inputs and outputs; all keys begin with `sightfix.`.
+/// The facts that a user of the graph needs besides its inputs and outputs; all keys begin with `sightfix.`.
 fn metadata_props(metadata: &ModelMetadata, regressor: &Regressor) -> Vec<StringStringEntryProto> {
     let origin = regressor.plane().origin();
     let mut entries = vec![

@@ -1,4 +1,4 @@
-//! Whether exported graphs are well formed. That they answer as the service does is proven with another runtime by
+//! Exported graphs are well formed. That they answer as the service does is proven with another runtime by
 //! `.ci/onnx`.
 
 use std::collections::HashSet;

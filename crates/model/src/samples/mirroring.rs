@@ -1,4 +1,4 @@
-//! Whether boxes and fixes show the ground as a camera sees it, or its mirror image.
+//! Test for a mirror image: boxes and fixes show the ground either as a camera sees it, or mirrored.
 //!
 //! A camera above the ground maps it to the image by a homography whose determinant has one sign below the horizon. So
 //! points that run anticlockwise on the ground, seen from above, run anticlockwise in the image, too. Swapped latitudes
@@ -24,12 +24,12 @@ const LEAST_SPREAD_PX: f64 = 8.0;
 const LEAST_CORRELATION: f64 = 0.15;
 /// The same in standard deviations of the correlation of as many independent points.
 const LEAST_SIGMAS: f64 = 3.0;
-/// Positions farther from the median than so many robust standard deviations are gross errors.
+/// Positions farther from the median than this number of robust standard deviations are gross errors.
 const GROSS_SIGMAS: f64 = 5.0;
 /// Normal standard deviations in a median absolute deviation.
 const SIGMAS_PER_MAD: f64 = 1.4826;
 
-/// Whether the image shows a mirror image of the positions; false where the points are too few, or too close to a line,
+/// True if the image shows a mirror image of the positions; false where the points are too few, or too close to a line,
 /// to tell.
 #[must_use]
 pub fn is_mirrored(points: &[FootPosition]) -> bool {

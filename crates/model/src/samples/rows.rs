@@ -1,7 +1,7 @@
 //! Training samples in the form that every recipe is fitted to: in metres, sorted by target and time,
 //! divided into traverses and into blocks of time.
 //!
-//! A *traverse* is a stretch of one target's samples without a gap. The true position that a sample may
+//! A *traverse* is an interval of one target's samples without a gap. The true position that a sample may
 //! state is never read here.
 
 use std::collections::HashMap;
@@ -43,7 +43,6 @@ pub(crate) struct TrainingRow {
     /// Index of the traverse, from 0; the rows of one are adjacent and in order of time.
     pub(crate) traverse: u32,
     pub(crate) bounding_box: BoundingBox,
-    /// The fix.
     pub(crate) position: Position,
     /// The regression target: the fix in the plane, or the smoothed position.
     pub(crate) label: EastNorth,
@@ -96,7 +95,7 @@ impl TrainingRows {
         Ok(all)
     }
 
-    /// Refuses sets of which more than half repeat one box and fix, from a detector or receiver that is
+    /// Refuses sets in which more than half of the samples repeat one box and fix, from a detector or receiver that is
     /// stuck: such rows outweigh all others, and a model that reproduces them has the least error.
     fn check_repetition(&self) -> Result<()> {
         let mut counts: HashMap<[u64; 6], usize> = HashMap::new();

@@ -8,7 +8,7 @@ use super::ground_map::GroundMap;
 use super::input::{FEWEST_ROWS, SiteFitError, SiteFitInput, SiteFix, SitePair, foot_and_size, is_foot_cut};
 use super::least_squares::{FixRow, LeastSquaresProblem, Transfer};
 use super::maps::SiteMaps;
-use crate::domain::GaussMarkovNoise;
+use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
 use crate::encoder::gaussian_process::projective_mean::Box4;
 use crate::encoder::gaussian_process::{FootPrior, UprightGeometry, UprightStarts};
 use crate::statistics::median;
@@ -19,6 +19,12 @@ const FIRST_FOOT_SIGMA_PX: f64 = 4.0;
 /// Ranges of the estimates.
 const SIGMA_RANGE_M: [f64; 2] = [0.02, 100.0];
 const FOOT_SIGMA_RANGE_PX: [f64; 2] = [0.5, 50.0];
+/// White shares of the receivers' variance that are compared.
+const WHITE_SHARES: [f64; 8] = [0.02, 0.05, 0.08, 0.12, 0.2, 0.3, 0.5, 0.8];
+/// Steps of the search for a standard deviation: to 0.1 %.
+const SECTIONS: usize = 20;
+/// Groups of receivers that starts leave out in turn.
+const START_GROUPS: usize = 8;
 /// Rounds of solution and noise estimate.
 const ROUNDS: usize = 3;
 /// The same where a prior on the heights of boxes is linearised again in each.
@@ -85,22 +91,56 @@ pub(crate) fn fit_site_observed(
 }
 
 impl LeastSquaresProblem {
-    /// Estimates the variance of the fixes from their whitened residuals and that of the feet from the median of
-    /// the transfers.
+    /// Estimates the variance of the feet from the median of the transfers, then the receivers' noise, variance and white
+    /// share, by the likelihood of the fixes' residuals.
     fn estimate_noise(&mut self, maps: &[GroundMap]) {
-        let residuals = self.fix_residuals(maps);
-        let freedom = residuals.count as f64 - 8.0 * maps.len() as f64;
-        if freedom > 0.0 {
-            let scale = residuals.square_sum / freedom;
-            let sigma_m = (self.noise().variance_m2 * scale).sqrt().clamp(SIGMA_RANGE_M[0], SIGMA_RANGE_M[1]);
-            self.set_noise(GaussMarkovNoise::new(sigma_m, self.noise().correlation));
-        }
         let distances = self.transfer_distances(maps);
         if distances.len() >= FEWEST_ROWS {
             let sigma_px = (median(distances) / MEDIAN_CHI_SQUARE).sqrt();
             self.foot_sigma_px = sigma_px.clamp(FOOT_SIGMA_RANGE_PX[0], FOOT_SIGMA_RANGE_PX[1]);
         }
+        self.set_foot_noise(maps);
+        let count: usize = self.receivers.iter().map(|rows| 2 * rows.len()).sum();
+        let freedom = count as f64 - 8.0 * maps.len() as f64;
+        if freedom <= 0.0 {
+            return;
+        }
+        let residuals = self.residuals_m(maps);
+        let GaussMarkovNoise { correlation, .. } = self.noise();
+        let noise_of = |white_share: f64| {
+            let correlation = NoiseCorrelation { white_share, ..correlation };
+            let of_log = |log_sigma: f64| GaussMarkovNoise::new(log_sigma.exp(), correlation);
+            let log_sigma = least_argument(SIGMA_RANGE_M.map(f64::ln), |log_sigma| {
+                self.noise_misfit(&residuals, &of_log(log_sigma))
+            });
+            (self.noise_misfit(&residuals, &of_log(log_sigma)), of_log(log_sigma))
+        };
+        let candidates = WHITE_SHARES.map(noise_of).into_iter();
+        if let Some((_, mut noise)) = candidates.min_by(|one, other| one.0.total_cmp(&other.0)) {
+            // The maps follow a part of the errors.
+            noise.variance_m2 *= count as f64 / freedom;
+            self.set_noise(noise);
+        }
     }
+}
+
+/// The argument of the least value of a function that falls, then rises, by golden sections.
+fn least_argument([mut low, mut high]: [f64; 2], value: impl Fn(f64) -> f64) -> f64 {
+    let section = 0.5 * (5.0_f64.sqrt() - 1.0);
+    let mut inner = [high - section * (high - low), low + section * (high - low)];
+    let mut values = inner.map(&value);
+    for _ in 0..SECTIONS {
+        if values[0] <= values[1] {
+            high = inner[1];
+            inner = [high - section * (high - low), inner[0]];
+            values = [value(inner[0]), values[0]];
+        } else {
+            low = inner[0];
+            inner = [inner[1], low + section * (high - low)];
+            values = [values[1], value(inner[1])];
+        }
+    }
+    0.5 * (low + high)
 }
 
 /// Share of the feet's variance that lasts: the autocovariance of the differences between two cameras over the lags of
@@ -162,7 +202,7 @@ fn receiver_rows(input: &SiteFitInput<'_>) -> Vec<Vec<FixRow>> {
     all.filter(|rows| !rows.is_empty()).collect()
 }
 
-/// Whether the border of an image hides the foot of either box.
+/// True if the border of an image hides the foot of either box.
 fn is_cut(pair: &SitePair, input: &SiteFitInput<'_>) -> bool {
     [0, 1].into_iter().any(|at| is_foot_cut(&pair.boxes[at], input.image_sizes[pair.cameras[at]]))
 }
@@ -209,7 +249,7 @@ fn upright_geometries(
     maps.iter_mut().enumerate().map(of_camera).collect()
 }
 
-/// What the boxes' heights say, linearised at the maps. A camera that is none there goes on without.
+/// Priors from the boxes' heights, linearised at the maps. A camera without such a prior is fitted without it.
 fn foot_priors(geometries: &mut [Option<UprightGeometry>], maps: &[GroundMap]) -> Vec<Option<FootPrior>> {
     let of_camera = |(geometry, map): (&mut Option<UprightGeometry>, &GroundMap)| {
         let prior = geometry.as_mut()?.prior_at(&map.0);
@@ -230,9 +270,13 @@ fn initial_maps(
 ) -> Result<Vec<GroundMap>, SiteFitError> {
     let mut maps: Vec<Option<GroundMap>> = (0..cameras)
         .map(|camera| {
-            let rows = receivers.iter().flatten();
-            let own = rows.flat_map(|row| row.feet.iter().map(move |foot| (foot, row.position)));
-            start(own.filter(|((at, _), _)| *at == camera).map(|((_, foot), position)| (*foot, position)))
+            let of_receiver = |rows: &Vec<FixRow>| -> Vec<(Box4, [f64; 2])> {
+                let feet = rows.iter().flat_map(|row| row.feet.iter().map(move |foot| (foot, row.position)));
+                feet.filter(|((at, _), _)| *at == camera)
+                    .map(|((_, foot), position)| (*foot, position))
+                    .collect()
+            };
+            best_start(&receivers.iter().map(of_receiver).filter(|rows| !rows.is_empty()).collect::<Vec<_>>())
         })
         .collect();
     while let Some(camera) = maps.iter().position(Option::is_none) {
@@ -251,6 +295,30 @@ fn initial_maps(
         maps[next] = Some(map);
     }
     Ok(maps.into_iter().flatten().collect())
+}
+
+/// The best of several starts: of all receivers, and without each of [`START_GROUPS`] groups of them in turn. One receiver
+/// with a large bias can lead a start to a map that no refinement leaves.
+fn best_start(receivers: &[Vec<(Box4, [f64; 2])>]) -> Option<GroundMap> {
+    let all: Vec<(Box4, [f64; 2])> = receivers.concat();
+    let without = |group: usize| {
+        let kept = receivers.iter().enumerate().filter(move |(at, _)| at % START_GROUPS != group);
+        start(kept.flat_map(|(_, rows)| rows.iter().copied()))
+    };
+    let groups = START_GROUPS.min(receivers.len());
+    let starts = start(all.iter().copied()).into_iter().chain((0..groups).filter_map(without));
+    let scored = starts.map(|map| (misfit(&map, &all), map));
+    scored.min_by(|one, other| one.0.total_cmp(&other.0)).map(|(_, map)| map)
+}
+
+/// Sum of Cauchy's loss of the distances between positions and fixes, in the first standard deviation.
+fn misfit(map: &GroundMap, rows: &[(Box4, [f64; 2])]) -> f64 {
+    let of_row = |(foot, position): &(Box4, [f64; 2])| {
+        let at = map.position(foot);
+        let squared_m2 = (at.east_m - position[0]).powi(2) + (at.north_m - position[1]).powi(2);
+        (squared_m2 / FIRST_SIGMA_M.powi(2)).ln_1p()
+    };
+    rows.iter().map(of_row).sum()
 }
 
 fn start(rows: impl Iterator<Item = (Box4, [f64; 2])>) -> Option<GroundMap> {

@@ -1,10 +1,10 @@
-//! What a site is trained on.
+//! The training input of a site.
 
 use crate::domain::{BoundingBox, ImageSize, NoiseCorrelation};
 use crate::geo::EastNorth;
 
-/// Correlation over time of the receivers' errors that a fit assumes: that of phones, in the open and near walls. A
-/// receiver with whiter errors only gets too wide a covariance by it.
+/// Correlation over time of the receivers' errors that a fit begins with: that of phones, in the open and near walls. The
+/// time constant stays; the white share is estimated.
 pub const RECEIVER_CORRELATION: NoiseCorrelation =
     NoiseCorrelation { white_share: 0.08, time_constant_s: 30.0 };
 
@@ -52,7 +52,7 @@ pub struct SiteFitInput<'a> {
     pub fixes: &'a [SiteFix],
     /// Targets in two cameras at once.
     pub pairs: &'a [SitePair],
-    /// Correlation over time of the receivers' errors; their variance is estimated.
+    /// Correlation over time of the receivers' errors to begin with; their variance and white share are estimated.
     pub correlation: NoiseCorrelation,
 }
 
@@ -86,7 +86,7 @@ pub(super) fn foot_and_size(bounding_box: &BoundingBox) -> [f64; 4] {
     ]
 }
 
-/// Whether the border of the image hides the foot of a box or a side of it. The upper border hides the head
+/// True if the border of the image hides the foot of a box or a side of it. The upper border hides the head
 /// only.
 pub(super) fn is_foot_cut(bounding_box: &BoundingBox, image_size: Option<ImageSize>) -> bool {
     const NEAR_PX: f64 = 1.0;

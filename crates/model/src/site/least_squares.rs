@@ -59,10 +59,12 @@ pub(super) struct LeastSquaresProblem {
     pub(super) transfers: Vec<Transfer>,
     /// Standard deviation of a foot per axis, px.
     pub(super) foot_sigma_px: f64,
-    /// What the heights of boxes say of each camera's parameters, if anything.
+    /// Priors of each camera's parameters from the heights of boxes, if any.
     pub(super) foot_priors: Vec<Option<FootPrior>>,
     /// Noise of the fixes per axis, and the filters that whiten each receiver's.
     noise: GaussMarkovNoise,
+    /// Variance per axis of the mean position of each row's feet, m2.
+    foot_m2: Vec<Vec<f64>>,
     whiteners: Vec<ReceiverWhitener>,
 }
 
@@ -74,12 +76,6 @@ struct NormalEquations {
     cost: f64,
 }
 
-/// Whitened residuals of the fixes, both axes of all receivers.
-pub(super) struct FixResiduals {
-    pub(super) square_sum: f64,
-    pub(super) count: usize,
-}
-
 impl LeastSquaresProblem {
     pub(super) fn new(
         receivers: Vec<Vec<FixRow>>,
@@ -87,8 +83,9 @@ impl LeastSquaresProblem {
         noise: GaussMarkovNoise,
         foot_sigma_px: f64,
     ) -> Self {
-        let whiteners = whiteners(&receivers, &noise);
-        Self { receivers, transfers, foot_sigma_px, foot_priors: Vec::new(), noise, whiteners }
+        let foot_m2: Vec<Vec<f64>> = receivers.iter().map(|rows| vec![0.0; rows.len()]).collect();
+        let whiteners = whiteners(&receivers, &noise, &foot_m2);
+        Self { receivers, transfers, foot_sigma_px, foot_priors: Vec::new(), noise, foot_m2, whiteners }
     }
 
     pub(super) const fn noise(&self) -> GaussMarkovNoise {
@@ -96,8 +93,34 @@ impl LeastSquaresProblem {
     }
 
     pub(super) fn set_noise(&mut self, noise: GaussMarkovNoise) {
-        self.whiteners = whiteners(&self.receivers, &noise);
+        self.whiteners = whiteners(&self.receivers, &noise, &self.foot_m2);
         self.noise = noise;
+    }
+
+    /// Takes the noise of the feet for a part of the noise of the rows, as large as the maps make it.
+    pub(super) fn set_foot_noise(&mut self, maps: &[GroundMap]) {
+        let foot_px2 = self.foot_sigma_px.powi(2);
+        let of_row = |row: &FixRow| foot_px2 * foot_variance_factor(maps, row);
+        self.foot_m2 = self.receivers.iter().map(|rows| rows.iter().map(of_row).collect()).collect();
+        self.set_noise(self.noise);
+    }
+
+    /// Twice the negative log likelihood of the fixes' residuals under a noise of the receivers.
+    pub(super) fn noise_misfit(&self, residuals: &[[Vec<f64>; 2]], noise: &GaussMarkovNoise) -> f64 {
+        let whiteners = whiteners(&self.receivers, noise, &self.foot_m2);
+        let log_determinants = 2.0 * whiteners.iter().map(|own| own.log_determinant).sum::<f64>();
+        log_determinants + whitened_squares(residuals, &whiteners)
+    }
+
+    /// Fixes less mean positions by receiver and axis, m.
+    pub(super) fn residuals_m(&self, maps: &[GroundMap]) -> Vec<[Vec<f64>; 2]> {
+        let of_receiver = |rows: &Vec<FixRow>| {
+            let means: Vec<[f64; 2]> = rows.iter().map(|row| mean_position(maps, row)).collect();
+            [0, 1].map(|axis| {
+                rows.iter().zip(&means).map(|(row, mean)| row.position[axis] - mean[axis]).collect()
+            })
+        };
+        self.receivers.iter().map(of_receiver).collect()
     }
 
     /// Refines the maps; returns their parameters' covariance. The observer is asked before each step.
@@ -147,24 +170,6 @@ impl LeastSquaresProblem {
         is_finite.then_some(covariance).ok_or(SiteFitError::NoSolution)
     }
 
-    /// Sum of squares of the whitened residuals of the fixes.
-    pub(super) fn fix_residuals(&self, maps: &[GroundMap]) -> FixResiduals {
-        let mut residuals = FixResiduals { square_sum: 0.0, count: 0 };
-        for (rows, whitener) in self.receivers.iter().zip(&self.whiteners) {
-            let misfits = rows.iter().map(|row| {
-                let mean_m = mean_position(maps, row);
-                [row.position[0] - mean_m[0], row.position[1] - mean_m[1]]
-            });
-            let (mut east, mut north): (Vec<f64>, Vec<f64>) = misfits.map(|[e, n]| (e, n)).unzip();
-            for column in [&mut east, &mut north] {
-                whitener.apply(column);
-                residuals.square_sum += column.iter().map(|value| value * value).sum::<f64>();
-                residuals.count += column.len();
-            }
-        }
-        residuals
-    }
-
     /// Squared standardised distances of the transfers that can be made, with unit foot noise.
     pub(super) fn transfer_distances(&self, maps: &[GroundMap]) -> Vec<f64> {
         let differences = self.transfers.iter().filter_map(|transfer| transfer.difference(maps));
@@ -173,7 +178,10 @@ impl LeastSquaresProblem {
 
     fn cost(&self, maps: &[GroundMap]) -> f64 {
         let transfers: f64 = self.transfers.iter().map(|it| self.transfer_cost(maps, it)).sum();
-        self.fix_residuals(maps).square_sum + transfers + prior_cost(maps) + self.foot_prior_cost(maps)
+        whitened_squares(&self.residuals_m(maps), &self.whiteners)
+            + transfers
+            + prior_cost(maps)
+            + self.foot_prior_cost(maps)
     }
 
     fn foot_prior_cost(&self, maps: &[GroundMap]) -> f64 {
@@ -311,13 +319,30 @@ fn dot(one: &[f64], other: &[f64]) -> f64 {
     one.iter().zip(other).map(|(one, other)| one * other).sum()
 }
 
-fn whiteners(receivers: &[Vec<FixRow>], noise: &GaussMarkovNoise) -> Vec<ReceiverWhitener> {
+fn whiteners(
+    receivers: &[Vec<FixRow>],
+    noise: &GaussMarkovNoise,
+    foot_m2: &[Vec<f64>],
+) -> Vec<ReceiverWhitener> {
     let noise = ReceiverNoise::of_gauss_markov(noise);
-    let of_receiver = |rows: &Vec<FixRow>| {
+    let of_receiver = |(rows, foot_m2): (&Vec<FixRow>, &Vec<f64>)| {
         let epochs: Vec<Epoch> = rows.iter().map(|row| Epoch { time_s: row.time_s, sequence: 0 }).collect();
-        ReceiverWhitener::new(&epochs, &noise, &vec![0.0; rows.len()])
+        ReceiverWhitener::new(&epochs, &noise, foot_m2)
     };
-    receivers.iter().map(of_receiver).collect()
+    receivers.iter().zip(foot_m2).map(of_receiver).collect()
+}
+
+/// Sum of squares of the whitened residuals of all receivers, in both axes.
+fn whitened_squares(residuals: &[[Vec<f64>; 2]], whiteners: &[ReceiverWhitener]) -> f64 {
+    let of_receiver = |(residuals, whitener): (&[Vec<f64>; 2], &ReceiverWhitener)| -> f64 {
+        let of_axis = |column: &Vec<f64>| {
+            let mut column = column.clone();
+            whitener.apply(&mut column);
+            column.iter().map(|value| value * value).sum::<f64>()
+        };
+        residuals.iter().map(of_axis).sum()
+    };
+    residuals.iter().zip(whiteners).map(of_receiver).sum()
 }
 
 /// A foot carried from one view into another.
@@ -365,6 +390,13 @@ fn mean_position(maps: &[GroundMap], row: &FixRow) -> [f64; 2] {
         let position = maps[*camera].position(foot);
         [sum[0] + share * position.east_m, sum[1] + share * position.north_m]
     })
+}
+
+/// Variance per axis of a row's mean position for unit noise of its feet, m2/px2.
+fn foot_variance_factor(maps: &[GroundMap], row: &FixRow) -> f64 {
+    let count = row.feet.len() as f64;
+    let of_foot = |(camera, foot): &(usize, Box4)| 0.5 * maps[*camera].tangent(foot).by_foot.norm_squared();
+    row.feet.iter().map(of_foot).sum::<f64>() / (count * count)
 }
 
 fn prior_cost(maps: &[GroundMap]) -> f64 {

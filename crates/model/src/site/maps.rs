@@ -40,7 +40,7 @@ impl SitePosition {
 #[derive(Debug, Clone)]
 pub struct SiteMaps {
     pub(super) maps: Vec<GroundMap>,
-    /// Of all parameters, camera by camera.
+    /// Covariance of all parameters, camera by camera.
     pub(super) covariance: DMatrix<f64>,
     pub(super) foot_sigma_px: f64,
     /// Share of the feet's variance that lasts while a target moves some metres.
@@ -138,7 +138,7 @@ impl SiteMaps {
         if pairs == 0.0 { own } else { bounded(sum / pairs, own) }
     }
 
-    /// Whether a camera's image has a foot point: by the image size, or by the feet of training where that is unknown.
+    /// True if a camera's image has a foot point: by the image size, or by the feet of training where that is unknown.
     fn is_in_view(&self, camera: usize, foot: [f64; 2]) -> bool {
         let [u_range, v_range] = match self.image_sizes[camera] {
             Some(size) => [[0.0, f64::from(size.width_px())], [0.0, f64::from(size.height_px())]],

@@ -88,8 +88,7 @@ impl SiteMaps {
 
     fn take(parts: &mut ModelParts, cameras: usize) -> Result<Self> {
         let foot_sigma_px = parts.positive_parameter(FOOT_SIGMA)?;
-        // Files of earlier versions do not tell which part of the noise lasts.
-        let foot_lasting_share = parts.parameter_or(FOOT_LASTING_SHARE, 0.0)?.clamp(0.0, 1.0);
+        let foot_lasting_share = parts.parameter(FOOT_LASTING_SHARE)?.clamp(0.0, 1.0);
         let tensors = &mut parts.tensors;
         let maps = tensors.take_f64(MAPS, &[cameras, MAP_NUMBERS])?;
         let maps: Vec<GroundMap> =

@@ -164,3 +164,26 @@ fn a_camera_without_fixes_is_fitted_by_its_neighbour() {
         SiteFitInput { image_sizes: &size, fixes: &one_sided.fixes, pairs: &[], correlation: CORRELATION };
     assert_eq!(fit_site(&input).err(), Some(SiteFitError::TooFewRows { camera: 1 }));
 }
+
+/// Exact fixes beside boxes that scatter: the feet's noise is no reason to bend a map.
+#[test]
+fn the_noise_of_the_feet_does_not_bend_the_maps() {
+    let (mut sum_m, mut count) = (0.0, 0.0);
+    for seed in 1..=4 {
+        let mut world = world(seed);
+        for fix in &mut world.fixes {
+            let own = world.boxes.iter().find(|(camera, own, _)| (*camera, *own) == fix.boxes[0]);
+            fix.position = own.expect("a box of the world").2;
+        }
+        let maps = fitted(&world, &world.pairs);
+        for (camera, _, truth) in &world.boxes {
+            let [u, v] = foot_px(if *camera == 0 { 0.0 } else { 10.0 }, *truth);
+            let exact = BoundingBox::new(u - 10.0, v - 60.0, 20.0, 60.0).expect("valid");
+            sum_m += maps.locate(*camera, &exact).position.distance_m(*truth);
+            count += 1.0;
+        }
+    }
+    let mean_m: f64 = sum_m / count;
+    println!("{mean_m:.3} m");
+    assert!(mean_m < 0.08, "{mean_m}");
+}

@@ -205,7 +205,7 @@ struct Group {
 }
 
 impl Group {
-    /// Of each centre from a point, in squared units.
+    /// Squared distance of each centre from a point, in squared units.
     #[inline(always)]
     fn squared_distances(&self, point: &Point) -> [f32; LANES] {
         let mut sums = [0.0; LANES];

@@ -111,7 +111,7 @@ impl ErrorModel {
         self.coverage.extrapolation_ratio(bounding_box)
     }
 
-    /// Whether a box is unlike those of training: far from all of them, or with edges that the decoder does
+    /// True if a box is unlike those of training: far from all of them, or with edges that the decoder does
     /// not reconstruct. For `paper` the first alone, as its error is Es eX at any eX.
     #[inline]
     pub(crate) fn is_outside_training(&self, extrapolation_ratio: f64, reconstruction_error: f64) -> bool {

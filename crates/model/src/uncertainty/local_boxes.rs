@@ -28,7 +28,7 @@ use crate::statistics::median;
 
 /// Fewest training boxes per region.
 const BOXES_PER_REGION: usize = 40;
-/// Most regions.
+/// The largest number of regions.
 const MOST_REGIONS: usize = 64;
 /// Least variance of an edge, px2, by its rounding to pixels.
 const ROUNDING_PX2: f64 = 0.25;
@@ -138,7 +138,7 @@ impl LocalBoxModel {
         tensors.put_f32("cells", &[self.regions.len(), NUMBERS], numbers);
     }
 
-    /// The stored regions; none in an earlier format.
+    /// The stored regions; none where the calibration has none.
     ///
     /// # Errors
     /// Names `weights` if the numbers are not those of regions.

@@ -5,7 +5,7 @@ use crate::artifact::ModelParts;
 use crate::domain::{Error, Result};
 use crate::geo::{EastNorth, PlaneCovariance};
 
-/// West, east, south and north end of the training positions, m; missing in earlier formats.
+/// West, east, south and north end of the training positions, m.
 const NAMES: [&str; 4] = ["scene_west_m", "scene_east_m", "scene_south_m", "scene_north_m"];
 /// Share of the training positions on either side that the ends ignore: those of false boxes near the horizon.
 const IGNORED_SHARE: f64 = 0.025;
@@ -42,7 +42,7 @@ impl Scene {
         }
     }
 
-    /// The scene of a model; `None` in an earlier format.
+    /// The scene of a model; `None` before it is known.
     ///
     /// # Errors
     /// Names the parameter that is missing although others are there, or cannot be used.

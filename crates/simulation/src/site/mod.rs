@@ -3,6 +3,7 @@
 //!
 //! A site is a function of its [`SiteOptions`] alone. Targets do not hide each other.
 
+mod groups;
 mod layout;
 mod motion;
 mod options;
@@ -14,6 +15,7 @@ use jiff::{SignedDuration, Timestamp};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
+use self::groups::Company;
 use self::layout::SiteCamera;
 use self::motion::Mover;
 pub use self::options::SiteOptions;
@@ -46,7 +48,7 @@ pub struct LabelledDetection {
 pub struct SimulatedCamera {
     /// Its id.
     pub id: CameraId,
-    /// What it detected.
+    /// The camera's detections.
     pub detections: Vec<LabelledDetection>,
 }
 
@@ -82,6 +84,7 @@ pub fn simulate_site(options: &SiteOptions) -> SimulatedSite {
             Mover::new(is_vehicle, street_m, draw(0), draw(1))
         })
         .collect();
+    let company = groups::drawn(options, &mut stream(options.seed, 3_000_000));
     let names: Vec<TargetId> =
         movers.iter().enumerate().map(|(index, mover)| name(&format!("{}-{index}", mover.class()))).collect();
     let mut carried = carried_receivers(options, &names);
@@ -102,9 +105,15 @@ pub fn simulate_site(options: &SiteOptions) -> SimulatedSite {
     for frame in 0..=frames {
         let elapsed_s = frame as f64 * options.frame_interval_s;
         let time = later(options.start, elapsed_s);
-        for (index, mover) in movers.iter_mut().enumerate() {
-            mover.advance(if frame == 0 { 0.0 } else { options.frame_interval_s });
-            site.truth.push((time, names[index].clone(), plane.to_position(mover.pose().position)));
+        for index in 0..count {
+            match company.get(index).copied().flatten() {
+                Some(Company { leader, offset_m }) => {
+                    let pose = movers[leader].pose();
+                    movers[index].accompany(pose, offset_m);
+                }
+                None => movers[index].advance(if frame == 0 { 0.0 } else { options.frame_interval_s }),
+            }
+            site.truth.push((time, names[index].clone(), plane.to_position(movers[index].pose().position)));
         }
         for observer in &mut observers {
             observer.observe(time, &mut movers);
@@ -126,7 +135,7 @@ struct CarriedReceiver {
     id: ReceiverId,
     target: usize,
     receiver: SimulatedReceiver,
-    /// Of its latest fix, s since the start.
+    /// Time of its latest fix, s since the start.
     latest_s: Option<f64>,
 }
 

@@ -31,7 +31,7 @@ pub(super) struct Mover {
     speed_deviation: f64,
     halt_s: f64,
     random: ChaCha8Rng,
-    /// Of the outline, drawn per camera: it must not change the motion.
+    /// Random numbers of the outline, drawn per camera: it must not change the motion.
     gait: ChaCha8Rng,
 }
 
@@ -99,6 +99,13 @@ impl Mover {
                 return;
             }
         }
+    }
+
+    /// Goes where another one goes, at a distance (m) from it.
+    pub(super) const fn accompany(&mut self, leader: Pose, offset_m: EastNorth) {
+        let EastNorth { east_m, north_m } = leader.position;
+        let position = EastNorth { east_m: east_m + offset_m.east_m, north_m: north_m + offset_m.north_m };
+        self.pose = Pose { position, ..leader };
     }
 
     /// Points of the outline.

@@ -5,7 +5,7 @@ use jiff::Timestamp;
 /// Default time of the first frame: 2026-01-05T08:00:00Z, in seconds since 1970.
 const START_S: i64 = 1_767_600_000;
 
-/// What is at the site, and how well it is seen.
+/// The targets and cameras of the site, and how well they see.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SiteOptions {
     /// Seed of everything but the cameras and the receivers' errors.
@@ -18,11 +18,13 @@ pub struct SiteOptions {
     pub cameras: usize,
     /// Number of walkers.
     pub walkers: usize,
+    /// Share of the walkers who walk in groups of two to four.
+    pub group_share: f64,
     /// Number of vehicles.
     pub vehicles: usize,
     /// Share of the targets that carry a receiver.
     pub receiver_share: f64,
-    /// Length, s.
+    /// Length of the simulation, s.
     pub duration_s: f64,
     /// Time between two frames of a camera, s. All cameras take theirs at the same instants.
     pub frame_interval_s: f64,
@@ -54,6 +56,7 @@ impl Default for SiteOptions {
             receiver_seed: 1,
             cameras: 3,
             walkers: 16,
+            group_share: 0.0,
             vehicles: 4,
             receiver_share: 0.5,
             duration_s: 300.0,

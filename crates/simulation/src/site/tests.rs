@@ -1,4 +1,4 @@
-//! What a simulated site contains.
+//! Tests of the contents of a simulated site.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -66,4 +66,29 @@ fn ids_break_and_swap_and_detections_are_missed_and_false() {
     assert!((0.87..0.93).contains(&kept), "{kept}");
     let false_per_frame = count(&rough, false) / 241.0;
     assert!((0.4..0.6).contains(&false_per_frame), "{false_per_frame}");
+}
+
+#[test]
+fn companions_stay_beside_whom_they_walk_with() {
+    let alone = SiteOptions { walkers: 12, vehicles: 2, duration_s: 20.0, ..SiteOptions::default() };
+    let site = simulate_site(&SiteOptions { group_share: 0.5, ..alone.clone() });
+    let plane = LocalPlane::new(site.origin);
+    let mut paths: BTreeMap<&TargetId, Vec<EastNorth>> = BTreeMap::new();
+    for (_, target, position) in &site.truth {
+        paths.entry(target).or_default().push(plane.to_plane(*position));
+    }
+    let is_beside = |one: &[EastNorth], other: &[EastNorth]| {
+        one.iter().zip(other).all(|(one, other)| one.distance_m(*other) < 2.7)
+    };
+    let has_company = |target: &TargetId| {
+        paths.iter().any(|(other, path)| *other != target && is_beside(path, &paths[target]))
+    };
+    assert_eq!(paths.keys().filter(|target| has_company(target)).count(), 6);
+    // Those who walk alone go where they went.
+    let leader_and_last = |site: &SimulatedSite| -> Vec<Position> {
+        let kept =
+            site.truth.iter().filter(|(_, target, _)| ["person-0", "person-11"].contains(&target.as_str()));
+        kept.map(|(_, _, position)| *position).collect()
+    };
+    assert_eq!(leader_and_last(&site), leader_and_last(&simulate_site(&alone)));
 }

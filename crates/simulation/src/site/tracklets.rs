@@ -73,7 +73,7 @@ impl CameraTracker {
         }
     }
 
-    /// Whether an event of that mean interval happens in this frame.
+    /// True if an event of that mean interval happens in this frame.
     fn happens(&mut self, mean_s: Option<f64>) -> bool {
         let draw = self.random.random::<f64>();
         mean_s.is_some_and(|mean_s| draw < 1.0 - (-self.frame_interval_s / mean_s).exp())

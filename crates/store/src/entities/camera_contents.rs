@@ -1,4 +1,5 @@
-//! What a process reads to follow the changes of cameras. PostgreSQL tells what has changed, and reads many at once.
+//! The contents that a process reads to follow the changes of cameras. PostgreSQL lists changed cameras, and reads
+//! many at once.
 
 use crate::database::{Backend, Database};
 use crate::domain::{CameraId, Result};

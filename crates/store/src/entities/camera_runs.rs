@@ -1,4 +1,4 @@
-//! What is particular to training runs of a camera: their output is one model version.
+//! Training runs of a camera: their output is one model version.
 
 use jiff::Timestamp;
 

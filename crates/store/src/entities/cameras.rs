@@ -3,10 +3,7 @@
 use jiff::Timestamp;
 
 use crate::database::Database;
-use crate::domain::{
-    AuditAction, Camera, CameraId, Error, ExpectedVersion, GnssBiasSigma, GnssError, NewCamera, Result,
-    SiteId, TargetClass,
-};
+use crate::domain::{AuditAction, Camera, CameraId, ExpectedVersion, NewCamera, Result, SiteId};
 use crate::locks::{Limit, lock_limit};
 use crate::query::{Query, RowLock, Session, query, query_scalar};
 use crate::refusals::no_camera;
@@ -14,7 +11,7 @@ use crate::row_decoder::StoredRow;
 use crate::rows::audit::Change;
 use crate::rows::cameras::{
     camera_columns as columns, camera_exists, check_limit, check_site, check_version, has_live_run,
-    read_camera, write_receivers,
+    read_camera, write_profile,
 };
 
 impl Database {
@@ -23,10 +20,8 @@ impl Database {
         let mut transaction = writer.begin().await?;
         lock_limit(&mut transaction, Limit::Cameras).await?;
         let insert = query(concat!(
-            "INSERT INTO cameras (display_name, image_width_px, image_height_px, gnss_sigma_m, \
-             gnss_bias_sigma_m, recipe, target_classes, labels, receivers, retrain_when_moved, learn_automatically, \
-             site_key, updated_at_us, id, created_at_us, revision) VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, \
-             $11, (SELECT key FROM sites WHERE id = $12), $13, $14, $15, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
+            "INSERT INTO cameras (profile, learn_automatically, site_key, updated_at_us, id, created_at_us, revision) \
+             VALUES ($1, $2, (SELECT key FROM sites WHERE id = $3), $4, $5, $6, 1) ON CONFLICT (id) DO NOTHING RETURNING ",
             columns!()
         ));
         let row = bind_profile(insert, profile, now)?
@@ -84,11 +79,9 @@ impl Database {
         lock_camera(&mut transaction, &profile.id).await?;
         check_version(&find_camera(&mut transaction, &profile.id).await?, expected)?;
         let update = query(concat!(
-            "UPDATE cameras SET display_name = $1, image_width_px = $2, image_height_px = $3, \
-             gnss_sigma_m = $4, gnss_bias_sigma_m = $5, recipe = $6, target_classes = $7, labels = $8, receivers = $9, \
-             retrain_when_moved = $10, learn_automatically = $11, \
-             site_key = (SELECT key FROM sites WHERE id = $12), updated_at_us = $13, \
-             revision = revision + 1 WHERE id = $14 RETURNING ",
+            "UPDATE cameras SET profile = $1, learn_automatically = $2, \
+             site_key = (SELECT key FROM sites WHERE id = $3), updated_at_us = $4, revision = revision + 1 \
+             WHERE id = $5 RETURNING ",
             columns!()
         ));
         let row = bind_profile(update, profile, now)?
@@ -170,22 +163,8 @@ pub(super) async fn lock_camera(session: &mut dyn Session, id: &CameraId) -> Res
 
 /// Binds the changeable columns in the order that INSERT and UPDATE share.
 fn bind_profile(query: Query<StoredRow>, profile: &NewCamera, now: Timestamp) -> Result<Query<StoredRow>> {
-    let sigma_m = match profile.gnss_error {
-        GnssError::Known(sigma_m) => Some(sigma_m.metres()),
-        GnssError::Unknown => None,
-    };
-    let classes: Vec<&str> = profile.target_classes.iter().map(TargetClass::as_str).collect();
     Ok(query
-        .bind(profile.display_name.clone())
-        .bind(profile.image_size.map(|size| i64::from(size.width_px())))
-        .bind(profile.image_size.map(|size| i64::from(size.height_px())))
-        .bind(sigma_m)
-        .bind(profile.gnss_bias_sigma.map(GnssBiasSigma::metres))
-        .bind(profile.recipe.as_str())
-        .bind(serde_json::to_string(&classes).map_err(Error::fault)?)
-        .bind(serde_json::to_string(&profile.labels).map_err(Error::fault)?)
-        .bind(write_receivers(&profile.receivers)?)
-        .bind(profile.retrain_when_moved)
+        .bind(write_profile(profile)?)
         .bind(profile.learn_automatically)
         .bind(profile.site.as_ref().map(|site| site.as_str().to_owned()))
         .bind(now.as_microsecond()))

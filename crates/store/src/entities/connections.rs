@@ -14,7 +14,7 @@ use crate::rows::connections::{
     check_limit, check_version, connection_columns as columns, connection_exists, read_connection,
 };
 
-/// What a change of a connection is based on, if the caller states it.
+/// The version that a change of a connection is based on, if the caller states it.
 type Expected = Option<ExpectedVersion<ConnectionKey>>;
 
 impl Database {

@@ -1,4 +1,4 @@
-//! What each backend does in its own way, every few seconds.
+//! Periodic work, every few seconds, that each backend does in its own way.
 
 use jiff::Timestamp;
 use sqlx::AssertSqlSafe;

@@ -1,4 +1,4 @@
-//! What is stored, an entity per file, with statements that both backends execute.
+//! The stored entities, a file each, with statements that both backends execute.
 
 mod audit;
 mod camera_contents;
@@ -17,12 +17,12 @@ mod outbox;
 mod pictures;
 mod recordings;
 mod retention;
+mod run_progress;
 mod runs;
 mod sample_retention;
 mod samples;
 mod site_runs;
 mod sites;
 mod source_offsets;
-mod training;
 
 pub use runs::RunSubject;

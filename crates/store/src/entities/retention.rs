@@ -1,4 +1,4 @@
-//! What is deleted one by one or by age: model versions, training runs, evaluations.
+//! Deletion one by one or by age: model versions, training runs, evaluations.
 
 use jiff::Timestamp;
 

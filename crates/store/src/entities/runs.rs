@@ -22,10 +22,10 @@ use crate::statements::idempotency::{find_answer, insert_answer, lock_key};
 /// A subject whose training runs are stored: [`CameraId`](crate::domain::CameraId) or
 /// [`SiteId`](crate::domain::SiteId).
 pub trait RunSubject: TrainingSubject + ReadRun {
-    /// What a run that has succeeded leaves.
+    /// The output of a run that has succeeded.
     type Output<'a>: Clone + Send + Sync;
 
-    /// What the audit log says of a start, and of a cancellation.
+    /// The actions in the audit log for a start and for a cancellation.
     #[doc(hidden)]
     const ACTIONS: [AuditAction; 2];
 

@@ -158,7 +158,7 @@ impl Database {
     }
 }
 
-/// A stretch of one camera's samples in key order, in the form that the primary key can seek.
+/// A range of one camera's samples in key order, in the form that the primary key can seek.
 struct Range {
     camera_key: i64,
     /// Exclusive. No target is empty text, so (from, "") lies before all samples at `from`.

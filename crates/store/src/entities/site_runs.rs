@@ -1,4 +1,4 @@
-//! What is particular to training runs of a site: their output is a model version of each camera.
+//! Training runs of a site: their output is a model version of each camera.
 
 use jiff::Timestamp;
 

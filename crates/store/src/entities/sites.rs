@@ -14,7 +14,7 @@ use crate::rows::sites::{
     check_limit, check_unused, check_version, read_site, site_columns as columns, site_exists,
 };
 
-/// What a change of a site is based on, if the caller states it.
+/// The version that a change of a site is based on, if the caller states it.
 type Expected = Option<ExpectedVersion<SiteKey>>;
 
 impl Database {

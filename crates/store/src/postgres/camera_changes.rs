@@ -1,4 +1,4 @@
-//! What has changed among the cameras since a poll: rows that a trigger writes.
+//! The cameras that have changed since a poll, in rows that a trigger writes.
 //!
 //! Transactions are committed in another order than they are numbered in. A poll therefore continues from the oldest
 //! transaction that had not ended when it was made, and may list a camera twice.

@@ -1,4 +1,4 @@
-//! What is needed to answer for many cameras at once: their profiles, pose changes and active models, three queries in all.
+//! The contents needed to answer for many cameras at once: profiles, pose changes and active models, in three queries.
 
 use std::collections::HashMap;
 

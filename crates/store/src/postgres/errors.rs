@@ -10,7 +10,7 @@ const ATTEMPTS: u32 = 5;
 /// Before the second attempt; before each further one so much more.
 const PAUSE: Duration = Duration::from_millis(10);
 
-/// What a failed statement means to its caller.
+/// The meaning of a failed statement for its caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Meaning {
     /// The database has ended the transaction in favour of another one; nothing of it was done.
@@ -84,7 +84,7 @@ pub(crate) fn failed(error: sqlx::Error) -> Error {
 pub(crate) struct Attempts(u32);
 
 impl Attempts {
-    /// Whether a call is to be made again, after a pause.
+    /// True if a call is to be made again, after a pause.
     pub(crate) async fn again(&mut self, error: Option<&Error>) -> bool {
         let is_repeatable = matches!(error, Some(Error::Refused(Refusal { may_repeat: true, .. })));
         self.0 += 1;

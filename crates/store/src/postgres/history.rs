@@ -1,4 +1,4 @@
-//! Whether the database still knows what it has acknowledged.
+//! Test that the database still has everything that it has acknowledged.
 //!
 //! A standby that becomes the primary may not have received the latest transactions; a backup that is restored ends
 //! before them. Numbers of transactions, revisions, versions and fences then go back and are given out again, so nothing

@@ -110,7 +110,7 @@ impl Store {
             .fetch_one(&mut *reader)
             .await
             .map_err(failed)?;
-        // Whether there is room again shows the next import: the disk is that of another machine.
+        // The next import shows whether there is space: the disk is that of another machine.
         self.inner.usage.has_room();
         Ok(StorageStatus {
             database_bytes: u64::try_from(bytes).unwrap_or_default(),

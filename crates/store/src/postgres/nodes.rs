@@ -22,19 +22,19 @@ use crate::statements::versions::keys_version;
 /// The registrations and ownerships of the nodes of one database.
 #[derive(Clone)]
 pub struct NodeLeases {
-    /// For renewals alone: they must not wait behind statements that use all other connections.
+    /// For renewals alone: they must not wait for statements that use all other connections.
     pub(super) renewals: PgPool,
     pub(super) pool: PgPool,
 }
 
-/// What came of the wish to own a camera.
+/// The outcome of an attempt to own a camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Acquired {
     /// The node owns it.
     Owned {
         /// Above the fence of every owner before.
         fence: i64,
-        /// Whether the owner before has ended without releasing it.
+        /// True if the owner before has ended without releasing it.
         is_takeover: bool,
     },
     /// Another registered node owns it, or another camera of its site.
@@ -47,7 +47,7 @@ pub enum Acquired {
 const COLUMNS: &str = "id, url, role, version, lease_ms, renewal, is_draining, started_at_us, renewed_at_us";
 type NodeRow = (String, Option<String>, String, String, i64, i64, bool, i64, i64);
 
-/// What a renewal has found.
+/// The findings of a renewal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Renewed {
     /// All registered nodes.
@@ -290,7 +290,7 @@ impl NodeLeases {
         owner(&mut reader, CameraKey(0), Some(site.0), None).await
     }
 
-    /// Of some cameras and sites those of which another registered node is the owner.
+    /// Among some cameras and sites, those that another registered node owns.
     ///
     /// # Errors
     /// As [`NodeLeases::register`].

@@ -143,7 +143,7 @@ async fn partitions(connection: &mut PgConnection, table: SampleTable) -> Result
     Ok(names.into_iter().filter(has_day).collect())
 }
 
-/// Whether samples of a week came before anything had added its partition. PostgreSQL refuses a partition of rows that
+/// True if samples of a week came before anything had added its partition. PostgreSQL refuses a partition of rows that
 /// the default one holds; they stay there, and are deleted in batches.
 async fn has_default_rows(connection: &mut PgConnection, table: SampleTable, week_us: i64) -> Result<bool> {
     let sql = format!("SELECT EXISTS (SELECT 1 FROM {table}_other WHERE time_us >= $1 AND time_us < $2)");
@@ -160,7 +160,7 @@ fn day_of(name: &str) -> &str {
     name.len().checked_sub(DAY_LENGTH).and_then(|start| name.get(start..)).unwrap_or(name)
 }
 
-/// Whether a name is that of a week of this table.
+/// True if a name is that of a week of this table.
 fn is_week(table: SampleTable, name: &str) -> bool {
     let day = name.strip_prefix(&*table.to_string()).and_then(|rest| rest.strip_prefix('_'));
     day.is_some_and(|day| day.len() == DAY_LENGTH && day.bytes().all(|byte| byte.is_ascii_digit()))

@@ -1,4 +1,4 @@
-//! What only PostgreSQL has: several processes, connections that end, migrations at once.
+//! Tests of PostgreSQL alone: several processes, connections that end, migrations at once.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -468,7 +468,7 @@ async fn a_node_owns_until_its_registration_ends_and_every_owner_has_a_higher_fe
     ours.release(one, &[(key, 1)]).await.expect("works");
     assert_eq!(ours.camera_owner(key).await.expect("works"), Some(two));
 
-    // What is released under an old fence is not released.
+    // A release under an old fence releases nothing.
     assert_eq!(acquire(&second, "a", two).await, owned(3, false));
     others.release(two, &[(key, 2)]).await.expect("works");
     assert_eq!(ours.camera_owner(key).await.expect("works"), Some(two));

@@ -9,6 +9,7 @@ use crate::domain::{
     GnssError, ImageSize, ModelMetadata, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision,
     SampleCount, SigmaM, SiteId, TargetClass, TargetId,
 };
+use crate::geo::Position;
 use crate::refusals::unknown_site;
 use crate::row_decoder::{RowDecoder, StoredRow};
 
@@ -36,7 +37,7 @@ pub struct CameraVersions {
     pub versions: Vec<CameraVersion>,
     /// Those that were deleted; `None` where `versions` has all that there are.
     pub deleted: Option<Vec<(CameraId, CameraKey)>>,
-    /// What to ask with next; `None` on a store that reads all in any case.
+    /// The mark to ask with next; `None` on a store that reads all in any case.
     pub upto: Option<ChangeMark>,
 }
 
@@ -64,9 +65,7 @@ pub(crate) fn read_version(row: &StoredRow) -> Result<CameraVersion> {
 /// Columns to select, in the order of [`read_camera`].
 macro_rules! camera_columns {
     () => {
-        "key, id, display_name, image_width_px, image_height_px, gnss_sigma_m, gnss_bias_sigma_m, recipe, \
-         target_classes, labels, receivers, retrain_when_moved, learn_automatically, revision, created_at_us, \
-         updated_at_us, active_model, (SELECT samples FROM sample_counts WHERE camera_key = key) AS samples_with_fix, \
+        "key, id, profile, learn_automatically, revision, created_at_us, updated_at_us, active_model, (SELECT samples FROM sample_counts WHERE camera_key = key) AS samples_with_fix, \
          (SELECT without_fix FROM sample_counts WHERE camera_key = key) AS samples_without_fix, \
          (SELECT sites.id FROM sites WHERE sites.key = site_key) AS site"
     };
@@ -88,18 +87,7 @@ pub(crate) fn read_camera(row: &StoredRow) -> Result<Camera> {
     let mut fields = RowDecoder::new("cameras", row);
     let key = CameraKey(fields.get()?);
     let id = fields.parse(CameraId::new)?;
-    let display_name = fields.get()?;
-    let width_px = fields.optional_count()?;
-    let height_px = fields.optional_count()?;
-    let image_size = width_px.zip(height_px).map(|(width, height)| ImageSize::new(width, height)).transpose();
-    let image_size = fields.checked(image_size)?;
-    let gnss_error = fields.parse_optional(SigmaM::new)?.map_or(GnssError::Unknown, GnssError::Known);
-    let gnss_bias_sigma = fields.parse_optional(GnssBiasSigma::new)?;
-    let recipe = fields.parse(|name: &str| name.parse())?;
-    let target_classes = fields.parse(read_classes)?;
-    let labels = fields.parse(serde_json::from_str::<BTreeMap<String, String>>)?;
-    let receivers = fields.parse(read_receivers)?;
-    let retrain_when_moved = fields.get()?;
+    let profile = fields.parse(|json: &str| read_profile(json, id))?;
     let learn_automatically = fields.get()?;
     let revision = fields.revision()?;
     let (created_at, updated_at) = (fields.timestamp()?, fields.timestamp()?);
@@ -108,26 +96,25 @@ pub(crate) fn read_camera(row: &StoredRow) -> Result<Camera> {
     let (with_fix, without_fix) = (samples()?, samples()?);
     let samples = SampleCount { all: with_fix + without_fix, without_fix };
     let site = fields.parse_optional(SiteId::new)?;
-    let profile = NewCamera {
-        id,
-        display_name,
-        image_size,
-        gnss_error,
-        gnss_bias_sigma,
-        recipe,
-        target_classes,
-        labels,
-        receivers,
-        retrain_when_moved,
-        learn_automatically,
-        site,
-    };
+    let profile = NewCamera { learn_automatically, site, ..profile };
     Ok(Camera { key, profile, revision, created_at, updated_at, active_model, samples })
 }
 
-fn read_classes(json: &str) -> Result<Vec<TargetClass>> {
-    let names: Vec<String> = serde_json::from_str(json).map_err(Error::fault)?;
-    names.iter().map(|name| TargetClass::new(name)).collect()
+/// What no statement asks for of a profile, as it is stored. A field that was added later is missing in older rows.
+#[derive(Serialize, Deserialize)]
+struct StoredProfile {
+    display_name: String,
+    /// Width and height.
+    image_size_px: Option<(u32, u32)>,
+    gnss_sigma_m: Option<f64>,
+    /// Longitude and latitude.
+    location_deg: Option<(f64, f64)>,
+    gnss_bias_sigma_m: Option<f64>,
+    recipe: String,
+    target_classes: Vec<String>,
+    labels: BTreeMap<String, String>,
+    receivers: Vec<StoredReceiver>,
+    retrain_when_moved: bool,
 }
 
 /// A receiver as it is stored.
@@ -136,31 +123,67 @@ struct StoredReceiver {
     receiver_id: String,
     target_id: String,
     clock_offset_us: i64,
-    #[serde(skip_serializing_if = "Option::is_none")]
     sigma_m: Option<f64>,
 }
 
-pub(crate) fn write_receivers(receivers: &Receivers) -> Result<String> {
-    let stored = receivers.iter().map(|receiver| StoredReceiver {
+pub(crate) fn write_profile(profile: &NewCamera) -> Result<String> {
+    let receiver = |receiver: &Receiver| StoredReceiver {
         receiver_id: receiver.receiver_id.as_str().to_owned(),
         target_id: receiver.target_id.as_str().to_owned(),
         clock_offset_us: receiver.clock_offset.microseconds(),
         sigma_m: receiver.sigma.map(SigmaM::metres),
-    });
-    serde_json::to_string(&stored.collect::<Vec<_>>()).map_err(Error::fault)
+    };
+    let stored = StoredProfile {
+        display_name: profile.display_name.clone(),
+        image_size_px: profile.image_size.map(|size| (size.width_px(), size.height_px())),
+        gnss_sigma_m: match profile.gnss_error {
+            GnssError::Known(sigma) => Some(sigma.metres()),
+            GnssError::Unknown => None,
+        },
+        location_deg: profile.location.map(|at| (at.longitude_deg(), at.latitude_deg())),
+        gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
+        recipe: profile.recipe.as_str().to_owned(),
+        target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
+        labels: profile.labels.clone(),
+        receivers: profile.receivers.iter().map(receiver).collect(),
+        retrain_when_moved: profile.retrain_when_moved,
+    };
+    serde_json::to_string(&stored).map_err(Error::fault)
 }
 
-fn read_receivers(json: &str) -> Result<Receivers> {
-    let stored: Vec<StoredReceiver> = serde_json::from_str(json).map_err(Error::fault)?;
-    let receiver = |stored: &StoredReceiver| {
+fn read_profile(json: &str, id: CameraId) -> Result<NewCamera> {
+    let stored: StoredProfile = serde_json::from_str(json).map_err(Error::fault)?;
+    let image_size = stored.image_size_px.map(|(width_px, height_px)| ImageSize::new(width_px, height_px));
+    let location = stored.location_deg.map(|(longitude, latitude)| Position::new(longitude, latitude));
+    let target_classes = stored.target_classes.iter().map(|class| TargetClass::new(class));
+    let receivers = stored.receivers.iter().map(StoredReceiver::to_domain);
+    Ok(NewCamera {
+        display_name: stored.display_name,
+        image_size: image_size.transpose()?,
+        gnss_error: match stored.gnss_sigma_m {
+            Some(sigma_m) => GnssError::Known(SigmaM::new(sigma_m)?),
+            None => GnssError::Unknown,
+        },
+        location: location.transpose().map_err(Error::fault)?,
+        gnss_bias_sigma: stored.gnss_bias_sigma_m.map(GnssBiasSigma::new).transpose()?,
+        recipe: stored.recipe.parse().map_err(Error::fault)?,
+        target_classes: target_classes.collect::<Result<_>>()?,
+        labels: stored.labels,
+        receivers: Receivers::new(receivers.collect::<Result<Vec<_>>>()?)?,
+        retrain_when_moved: stored.retrain_when_moved,
+        ..NewCamera::named(id)
+    })
+}
+
+impl StoredReceiver {
+    fn to_domain(&self) -> Result<Receiver> {
         Ok(Receiver {
-            receiver_id: ReceiverId::new(&stored.receiver_id)?,
-            target_id: TargetId::new(&stored.target_id)?,
-            clock_offset: ClockOffset::from_microseconds(stored.clock_offset_us)?,
-            sigma: stored.sigma_m.map(SigmaM::new).transpose()?,
+            receiver_id: ReceiverId::new(&self.receiver_id)?,
+            target_id: TargetId::new(&self.target_id)?,
+            clock_offset: ClockOffset::from_microseconds(self.clock_offset_us)?,
+            sigma: self.sigma_m.map(SigmaM::new).transpose()?,
         })
-    };
-    Receivers::new(stored.iter().map(receiver).collect::<Result<Vec<_>>>()?)
+    }
 }
 
 pub(crate) use camera_columns;

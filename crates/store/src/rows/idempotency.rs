@@ -10,7 +10,7 @@ use crate::limits::StoreLimits;
 pub struct IdempotencyRecord {
     /// The client's key.
     pub key: IdempotencyKey,
-    /// What the request asks for.
+    /// The digest of the request.
     pub digest: RequestDigest,
 }
 

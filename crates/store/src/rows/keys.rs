@@ -22,7 +22,7 @@ pub struct KeysVersion {
 }
 
 impl KeysVersion {
-    /// Whether no key was ever created.
+    /// True if no key was ever created.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.rows == 0
@@ -53,7 +53,7 @@ pub(crate) fn read_key(row: &StoredRow) -> Result<(ApiKey, SecretDigest)> {
 
 pub(crate) use select_keys;
 
-/// Refuses a key where so many are stored already.
+/// Refuses a key if the largest number of keys is stored already.
 pub(crate) fn check_limit(keys: i64, limit: u32) -> Result<()> {
     if keys < i64::from(limit) {
         return Ok(());

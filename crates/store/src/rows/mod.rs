@@ -1,4 +1,4 @@
-//! What is in a row, whatever the backend: the columns to select, the conversion into values of the domain, and
+//! The rows, whatever the backend: the columns to select, the conversion into values of the domain, and
 //! the rules that need no statement.
 
 pub(super) mod audit;

@@ -24,7 +24,7 @@ macro_rules! select_models {
 /// A model to be stored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewModel<'a> {
-    /// Its description.
+    /// The description of the version.
     pub metadata: &'a ModelMetadata,
     /// Its weights.
     pub weights: &'a [u8],
@@ -138,8 +138,8 @@ pub(crate) fn read_content(
     Ok((metadata, weights))
 }
 
-/// Of the latest two activations that were not rolled back (position and number, the latest first): the position
-/// to be rolled back and the version that becomes active.
+/// Finds the position to be rolled back and the version that becomes active, in the latest two activations that were
+/// not rolled back (position and number, the latest first).
 pub(crate) fn roll_back_target(camera: &CameraId, latest: &[(i64, i64)]) -> Result<(i64, i64)> {
     match *latest {
         [(position, _), (_, number)] => Ok((position, number)),

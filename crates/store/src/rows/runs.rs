@@ -23,7 +23,7 @@ pub(crate) const LINE_BYTES: usize = 4_000;
 pub struct RunOutput<'a> {
     /// The fitted model.
     pub model: NewModel<'a>,
-    /// Whether it becomes the active version in the same transaction.
+    /// True if it becomes the active version in the same transaction.
     pub activate: bool,
 }
 
@@ -35,7 +35,7 @@ pub trait ReadRun: TrainingSubject + Clone + PartialEq + Send + Sync + 'static {
     /// The table of its runs.
     #[doc(hidden)]
     const JOBS: &'static JobTable;
-    /// What messages call it.
+    /// The name of such a run in messages.
     #[doc(hidden)]
     const KIND: &'static str;
     /// Its own table.

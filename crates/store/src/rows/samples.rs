@@ -63,13 +63,13 @@ pub(crate) const NEWEST_TIME: &str = "SELECT max(time_us) FROM (\
      SELECT (SELECT max(time_us) FROM samples_without_fix WHERE camera_key = counts.camera_key) \
      FROM sample_counts AS counts) AS newest";
 
-/// What the audit log says of samples that are deleted for their age.
+/// The entry of the audit log for samples that are deleted for their age.
 pub(crate) fn expired(before: Timestamp) -> Change<'static> {
     Change::of(AuditAction::SamplesDeleted, format!("samples from before {before}, by limits.sample_days"))
 }
 
 impl SampleTable {
-    /// Both.
+    /// Both tables.
     pub(crate) const ALL: [Self; 2] = [Self::WithFix, Self::WithoutFix];
 
     /// The table of a sample.

@@ -10,7 +10,7 @@ use crate::row_decoder::RowDecoder;
 /// The output of a run: a model for each camera, which are activated together or not at all.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SiteRunOutput<'a> {
-    /// What the run found out. The store enters the versions' numbers into its cameras, which are in the order of
+    /// The run's findings. The store enters the versions' numbers into its cameras, which are in the order of
     /// the models.
     pub report: SiteTrainingReport,
     /// The fitted models.

@@ -16,7 +16,7 @@ use crate::folder_fault::{FolderFault, FolderFaultKind};
 
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// What to do with a file that has the name of the backup.
+/// The rule for a file that has the name of the backup.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ExistingFile {
     /// Nothing: the backup is refused.
@@ -81,12 +81,12 @@ fn publish(mut copy: NamedTempFile, target: PathBuf, existing: ExistingFile) -> 
     flush_entries(parent_of(&target)).map_err(|error| not_written(&target, &error))
 }
 
-/// What a backup holds, and whether its digest proves that it is what was written.
+/// The contents of a backup, and the proof by its digest that it is what was written.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BackupReport {
-    /// What the database in it holds.
+    /// The contents of the database in it.
     pub report: DatabaseReport,
-    /// Whether it has a digest, as all backups have but those of other programs.
+    /// True if it has a digest, as all backups have but those of other programs.
     pub has_digest: bool,
 }
 

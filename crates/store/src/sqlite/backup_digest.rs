@@ -25,7 +25,7 @@ const BUFFER_BYTES: usize = 256 << 10;
 pub(super) struct BackupContent {
     bytes: u64,
     sha256: String,
-    /// Whether the file states its digest, and thus what was read is what was written.
+    /// True if the file states its digest, and thus what was read is what was written.
     pub(super) is_proven: bool,
 }
 

@@ -52,10 +52,10 @@ pub(crate) fn failed(error: sqlx::Error) -> Error {
     }
 }
 
-/// Of the process, as the log is: a server has one store, and an error does not know which statement it is of.
+/// One flag of the process, as the log is: a server has one store, and an error does not know its statement.
 static DAMAGE_MET: AtomicBool = AtomicBool::new(false);
 
-/// Whether a statement has met a damaged page since the process was started.
+/// True if a statement has met a damaged page since the process was started.
 pub(super) fn has_met_damage() -> bool {
     DAMAGE_MET.load(Ordering::Relaxed)
 }

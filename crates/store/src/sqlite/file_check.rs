@@ -1,4 +1,4 @@
-//! What a database file holds, and whether it is sound: for backups, restores and `sightfix doctor`.
+//! The contents and the integrity of a database file: for backups, restores and `sightfix doctor`.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ use crate::folder_fault::{FolderFault, FolderFaultKind};
 const CHECKSUMS_STEP: i64 = 5;
 const BOXES_WITHOUT_FIX_STEP: i64 = 7;
 
-/// What a database file holds.
+/// The contents of a database file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DatabaseReport {
     /// Step of its schema.
@@ -25,15 +25,15 @@ pub struct DatabaseReport {
     pub newest_step: i64,
     /// Size of the file, without its write-ahead log.
     pub bytes: u64,
-    /// Cameras.
+    /// Number of cameras.
     pub cameras: u64,
     /// Samples, with a fix or without.
     pub samples: u64,
-    /// Model versions.
+    /// Number of model versions.
     pub models: u64,
     /// Time of the latest sample.
     pub latest_sample_at: Option<Timestamp>,
-    /// What SQLite's integrity check found; empty for a sound file.
+    /// The findings of SQLite's integrity check; empty for a sound file.
     pub problems: Vec<String>,
     /// Model versions that do not match their checksums.
     pub damaged_models: Vec<String>,
@@ -55,7 +55,7 @@ impl DatabaseReport {
     }
 }
 
-/// Whether other processes may be using a database file.
+/// States if other processes may be using a database file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum FileUse {
     /// Nobody does, as with a backup: nothing is created beside it.
@@ -176,7 +176,7 @@ async fn damaged_models(connection: &mut SqliteConnection) -> sqlx::Result<Vec<S
     Ok(damaged)
 }
 
-/// Whether a folder has a database.
+/// True if a folder has a database.
 #[must_use]
 pub fn has_database(folder: &Path) -> bool {
     folder.join(DATABASE).exists()

@@ -57,7 +57,7 @@ fn prepare_blocking(folder: &Path) -> Result<PathBuf> {
                 Error::fault(format!("cannot flush the folder {}: {error}", folder.display()))
             })?;
         }
-        // What else is wrong with the file, opening it will tell.
+        // Opening the file will show its other faults.
         Err(_) => {
             restrict_to_owner(&database);
             COMPANIONS.iter().for_each(|name| restrict_to_owner(&folder.join(name)));

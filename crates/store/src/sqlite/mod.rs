@@ -69,7 +69,7 @@ struct Inner {
     space: Arc<Space>,
     /// `None` where the process could not announce itself, and after closing.
     presence: Mutex<Option<Presence>>,
-    /// Of a server, until it is closed.
+    /// The lock of a server, until the store is closed.
     server_lock: Mutex<Option<ServerLock>>,
 }
 

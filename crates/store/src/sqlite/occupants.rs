@@ -23,7 +23,7 @@ pub struct Occupant {
     pub pid: u32,
     /// Name of its host.
     pub host: String,
-    /// What it does.
+    /// Its purpose.
     pub role: String,
 }
 

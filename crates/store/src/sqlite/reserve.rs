@@ -22,7 +22,7 @@ const SLACK_BYTES: u64 = 256 << 10;
 pub(super) struct Reserve {
     folder: PathBuf,
     bytes: u64,
-    /// What was released and is not set aside again yet.
+    /// Bytes that were released and are not set aside again yet.
     owed_bytes: Arc<AtomicU64>,
 }
 
@@ -50,7 +50,7 @@ impl Reserve {
         .await
     }
 
-    /// Whether less space is left on the disk than is to be reserved.
+    /// True if less space is left on the disk than is to be reserved.
     pub(super) async fn is_disk_scarce(&self) -> Result<bool> {
         let bytes = self.bytes;
         Ok(self.available_bytes().await?.is_some_and(|available| available < bytes))

@@ -17,10 +17,10 @@ use super::occupants::Presence;
 use super::server_lock::{ServerLock, in_use};
 use crate::domain::{Error, ErrorKind, Result};
 
-/// What this process is to others while it restores.
+/// The role of this process to others while it restores.
 const ROLE: &str = "sightfix restore";
 
-/// What to do with a backup that has no digest, so that nothing shows whether a value in it was changed.
+/// The rule for a backup that has no digest, so that nothing shows if a value in it was changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MissingDigest {
     /// It is refused.
@@ -29,16 +29,16 @@ pub enum MissingDigest {
     Accept,
 }
 
-/// What a restore has done.
+/// The outcome of a restore.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Restored {
-    /// What the backup holds.
+    /// The contents of the backup.
     pub report: DatabaseReport,
     /// Where the database before it is kept, if there was one.
     pub kept: Option<PathBuf>,
 }
 
-/// Puts a backup in place of a folder's database, which is kept under another name. The folder is made if
+/// Replaces a folder's database by a backup; the former is kept under another name. The folder is made if
 /// there is none. Whenever the process is killed, the folder has either database, complete.
 ///
 /// # Errors

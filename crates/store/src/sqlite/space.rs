@@ -81,8 +81,8 @@ impl Deletion<'_> {
         self.writer.begin().await
     }
 
-    /// To be called after the commit: gives the freed space back at once where the disk has none.
-    /// What fails here is tried again by [`Store::maintain`].
+    /// Gives the freed space back at once where the disk has none. To be called after the commit. After a failure here
+    /// [`Store::maintain`] tries again.
     pub(crate) async fn reclaim(mut self) {
         let space = &self.store.inner.space;
         let reclaimed = async {
@@ -121,7 +121,7 @@ impl Store {
         Ok(Deletion { store: self, writer, was_scarce })
     }
 
-    /// Whether imports are refused for want of space, as far as is known without looking.
+    /// True if imports are refused for want of space, as far as is known without looking.
     #[must_use]
     pub(crate) fn is_full(&self) -> bool {
         self.inner.space.usage.is_full()

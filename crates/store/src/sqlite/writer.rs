@@ -11,7 +11,7 @@ use crate::refusals::closed;
 /// Pages above the database's limit that are left to transactions other than growing ones.
 const HEADROOM_PAGES: u32 = 256;
 
-/// What a transaction does to the size of the database.
+/// The effect of a transaction on the size of the database.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Growth {
     /// Stores what clients send, up to the database's limit.
@@ -36,7 +36,7 @@ pub(super) struct Writer {
 
 struct OpenConnection {
     connection: SqliteConnection,
-    /// What the connection is set to; `None` while it is being changed, so that a caller that is
+    /// The mode of the connection; `None` while it is being changed, so that a caller that is
     /// cancelled half way leaves no wrong assumption behind.
     mode: Option<ConnectionMode>,
     /// A transaction could not begin, and no other process held the file.
@@ -48,7 +48,7 @@ impl OpenConnection {
         Self { connection, mode: None, broken: false }
     }
 
-    /// Whether the library assumes a transaction that does not exist. That happens when the database
+    /// True if the library assumes a transaction that does not exist. That happens when the database
     /// ends one by itself (a full disk, an I/O error): the library's own end of it then fails.
     async fn is_stuck(&mut self) -> Result<bool, sqlx::Error> {
         if self.connection.is_in_transaction() {

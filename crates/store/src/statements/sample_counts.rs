@@ -1,4 +1,4 @@
-//! How many samples each camera has.
+//! Numbers of samples of each camera.
 
 use sqlx::AssertSqlSafe;
 

@@ -14,6 +14,7 @@ fn full(name: &str) -> NewCamera {
         display_name: "North \"gate\" – 2".to_owned(),
         image_size: Some(ImageSize::new(1920, 1080).expect("a size")),
         gnss_error: GnssError::Known(SigmaM::new(2.7).expect("a sigma")),
+        location: Some(Position::new(103.98678, -30.6280135).expect("a position")),
         gnss_bias_sigma: Some(GnssBiasSigma::new(1.3).expect("a sigma")),
         recipe: Recipe::Projective,
         target_classes: vec![

@@ -1,5 +1,5 @@
-//! What both backends promise. Every case has a file of its own, or, where `SIGHTFIX_TEST_POSTGRES` is the URL of a
-//! server's database, a database of its own on that server (`.ci/postgres`).
+//! Tests of what both backends promise. Every case has a file of its own, or, where `SIGHTFIX_TEST_POSTGRES` is the URL
+//! of a server's database, a database of its own on that server (`.ci/postgres`).
 
 mod cameras;
 mod connections;
@@ -129,7 +129,7 @@ pub(super) fn id(text: &str) -> CameraId {
     CameraId::new(text).expect("a slug")
 }
 
-/// So many seconds into a day of 2020.
+/// An instant this number of seconds into a day of 2020.
 pub(super) fn at(second: i64) -> Timestamp {
     Timestamp::from_second(1_607_900_000 + second).expect("in range")
 }

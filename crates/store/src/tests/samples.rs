@@ -197,7 +197,7 @@ async fn samples_of_before_an_instant_are_deleted_and_counted_no_more() {
     let kept = vec![7 * DAY, 7 * DAY + 1, 8 * DAY, 60 * DAY];
     assert_eq!(stored().await, (kept, SampleCount { all: 4, without_fix: 1 }, 8));
     assert_eq!(store.retain_samples(Some(at(week + 7 * DAY)), at(week + 9 * DAY)).await.expect("works"), 0);
-    // What comes late goes with the next call.
+    // Late samples go with the next call.
     let late = store.insert_samples(&camera, vec![timed(week + 2)], Durability::Synced).await;
     assert_eq!(late.expect("stored").accepted, 1);
     assert_eq!(store.retain_samples(Some(at(week + 7 * DAY)), at(week + 9 * DAY)).await.expect("works"), 1);

@@ -1,4 +1,4 @@
-//! What happens at a site.
+//! The events of a site.
 
 use std::sync::Arc;
 
@@ -12,11 +12,11 @@ use crate::domain::{CameraId, LiveId, TargetId};
 pub struct SiteEvent {
     /// Its instant by the clock of the cameras.
     pub time: Timestamp,
-    /// What happened.
+    /// The kind of event.
     pub kind: SiteEventKind,
 }
 
-/// What happened at a site.
+/// The kinds of events of a site.
 #[derive(Debug)]
 pub enum SiteEventKind {
     /// A target was measured.
@@ -33,12 +33,7 @@ pub enum SiteEventKind {
         to: CameraId,
     },
     /// The target of a track is known by a receiver that it carries.
-    Identified {
-        /// The track.
-        track: LiveId,
-        /// The target.
-        target_id: TargetId,
-    },
+    Identified { track: LiveId, target_id: TargetId },
     /// Two tracks were of one target.
     Merged {
         /// The track that goes on.

@@ -1,4 +1,4 @@
-//! What live observations hand to the tracker of their camera's site.
+//! The items that live observations hand to the tracker of their camera's site.
 
 use tokio::sync::mpsc;
 
@@ -31,7 +31,7 @@ impl App {
                 self.metrics.site_item(SiteItemOutcome::Overflow);
             }
         }
-        site.live.track_of(&camera.id, observation.target_id()?)
+        site.live.track_of(&camera.id, &observation.tracked_as()?)
     }
 
     fn site_resources(&self) -> task::SiteResources {
@@ -54,6 +54,7 @@ fn items_of<'a>(
         camera: camera.id.clone(),
         time: observation.time(),
         target_id: observation.target_id().cloned(),
+        tracked_as: observation.tracked_as(),
         position,
         source,
     };

@@ -13,11 +13,13 @@ pub(super) struct SiteItem {
     pub(super) camera: CameraId,
     pub(super) time: Timestamp,
     pub(super) target_id: Option<TargetId>,
+    /// The name under which the camera's tracker follows the target.
+    pub(super) tracked_as: Option<TargetId>,
     pub(super) position: Position,
     pub(super) source: ItemSource,
 }
 
-/// What measured a position.
+/// The sensor that measured a position.
 #[derive(Debug)]
 pub(super) enum ItemSource {
     /// A box, through the camera's model.
@@ -25,15 +27,15 @@ pub(super) enum ItemSource {
         /// Covariance of the error, m2, axes east and north of the model's plane, which those of the site's plane
         /// are to within its range.
         covariance_m2: PlaneCovariance,
-        /// Of it, the error of the map from pixels to the ground, which is the same from frame to frame at a
-        /// place, m2.
+        /// The part of it that is the error of the map from pixels to the ground, which is the same from frame to frame
+        /// at a place, m2.
         map_covariance_m2: PlaneCovariance,
         /// How it divides among cameras that were trained together; `None` for a camera that was trained by itself.
         joint: Option<JointError>,
         /// Origin of the model's plane.
         model_origin: Position,
     },
-    /// A receiver.
+    /// A fix of a receiver.
     Fix {
         /// Error variance per axis, m2.
         variance_m2: f64,

@@ -57,7 +57,7 @@ impl App {
         })
     }
 
-    /// What happens at a site: after an event, or from now on.
+    /// The events of a site: after an event, or from now on.
     ///
     /// # Errors
     /// As [`App::world_tracks`].

@@ -15,17 +15,15 @@ const SEEN_FOR: SignedDuration = SignedDuration::from_secs(1);
 /// Where a target of a site is by its world track, at the latest instant measured.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorldTrackPoint {
-    /// The track.
     pub id: LiveId,
     /// The target, once one of its receivers is known.
     pub target_id: Option<TargetId>,
-    /// The instant.
+    /// The instant of the latest measurement.
     pub time: Timestamp,
     /// Time of the first measurement.
     pub started_at: Timestamp,
-    /// Where.
+    /// The target's position.
     pub position: Position,
-    /// Velocity.
     pub velocity: Velocity,
     /// Speed and course.
     pub motion: Motion,
@@ -53,7 +51,6 @@ impl WorldTrackPoint {
 /// A camera that sees a target.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorldSighting {
-    /// The camera.
     pub camera_id: CameraId,
     /// The id that its tracker gives the target, if any.
     pub tracker_id: Option<TargetId>,
@@ -62,7 +59,7 @@ pub struct WorldSighting {
 }
 
 impl WorldSighting {
-    /// Whether the camera still sees the target at an instant.
+    /// True if the camera still sees the target at an instant.
     pub(super) fn is_current(last_seen_at: Timestamp, now: Timestamp) -> bool {
         now.duration_since(last_seen_at) <= SEEN_FOR
     }

@@ -14,7 +14,6 @@ use crate::telemetry::Metrics;
 pub struct StoredSiteEvent {
     /// A reader continues after it.
     pub id: LiveId,
-    /// The event.
     pub event: Arc<SiteEvent>,
 }
 
@@ -23,9 +22,8 @@ pub struct StoredSiteEvent {
 pub struct LostSiteEvents {
     /// The last of them; a reader continues after it.
     pub id: LiveId,
-    /// How many; `None` where nobody knows.
+    /// Number of lost events; `None` where nobody knows.
     pub events: Option<u64>,
-    /// Why.
     pub reason: LossReason,
 }
 
@@ -83,7 +81,7 @@ impl SiteEvents {
         Self { reader: live.events.reader(number), live, restarted, reason, metrics, watch }
     }
 
-    /// Whether they have ended since they continue on another node: the reader should ask again.
+    /// True if they have ended since they continue on another node: the reader should ask again.
     #[must_use]
     pub fn continue_elsewhere(&self) -> bool {
         self.watch.has_ended()

@@ -15,7 +15,7 @@ use crate::geo::Position;
 
 /// Queue, tracks and events of one site.
 pub(in crate::app) struct SiteLive {
-    /// Of the ids of tracks and events.
+    /// The epoch of the ids of tracks and events.
     pub(super) epoch: u32,
     /// Origin of the plane, if the operator states it.
     pub(super) origin: Mutex<Option<Position>>,

@@ -18,7 +18,7 @@ const TICK: Duration = Duration::from_millis(50);
 /// Items that are taken together, if they are there.
 const BATCH: usize = 256;
 
-/// What the task needs of the application.
+/// The parts of the application that the task needs.
 pub(super) struct SiteResources {
     pub(super) clock: Clock,
     pub(super) limits: Limits,

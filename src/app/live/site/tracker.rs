@@ -79,7 +79,7 @@ struct Carrier {
 /// A world tracker with its plane.
 struct ActiveTracker {
     tracker: WorldTracker,
-    /// Whether the plane is that of the operator or of a model; a fix alone may be anywhere.
+    /// True if the plane is that of the operator or of a model; a fix alone may be anywhere.
     has_trusted_plane: bool,
     /// Reading of the monotonic clock when a frame was tracked last.
     tracked_at: Duration,
@@ -147,9 +147,9 @@ impl SiteTracker {
         if let Some(carrier) = self.carriers.get_mut(target_id) {
             carrier.cameras.insert(camera.clone());
             carrier.noted_at = now;
-            // Of a recording that is played again the times are far behind.
-            let behind = carrier.fixed_at.duration_since(time);
-            let is_new = behind.is_negative() || behind > self.fix_lateness;
+            // The times of a recording that is played again are much earlier.
+            let lag = carrier.fixed_at.duration_since(time);
+            let is_new = lag.is_negative() || lag > self.fix_lateness;
             if is_new {
                 carrier.fixed_at = time;
             }
@@ -165,7 +165,7 @@ impl SiteTracker {
         true
     }
 
-    /// Whether time changes anything: frames wait, or tracks may end.
+    /// True if time changes anything: frames wait, or tracks may end.
     pub(super) fn is_busy(&self) -> bool {
         !self.frames.is_empty() || self.active.as_ref().is_some_and(|it| it.tracker.tracks().next().is_some())
     }
@@ -382,7 +382,7 @@ impl SiteTracker {
                 WorldEvent::Merged { track, ended } => {
                     let (track, ended) = (self.id_of(track), self.id_of(ended));
                     if self.announced.contains_key(&ended) {
-                        // A track that was not confirmed is, once it has taken up one that was.
+                        // A tentative track that merges a confirmed one becomes confirmed.
                         self.announce_start(track, time);
                     }
                     self.announce_end(ended, time, SiteEventKind::Merged { track, ended });
@@ -450,7 +450,7 @@ fn detection_of(
     };
     let noise_m2 = covariance_m2.minus(*map_covariance_m2).minus(lasting_noise_m2);
     Ok(WorldDetection {
-        tracker_id: item.target_id.clone(),
+        tracker_id: item.tracked_as.clone(),
         receiver: carrier.map(ReceiverId::from),
         position,
         covariance_m2: noise_m2,
@@ -488,6 +488,7 @@ mod tests {
                 camera: CameraId::new("a").expect("a slug"),
                 time: Timestamp::from_millisecond(1_000 * START_S + ms).expect("in range"),
                 target_id: Some(TargetId::new(tracker_id).expect("a name")),
+                tracked_as: Some(TargetId::new(tracker_id).expect("a name")),
                 position: origin,
                 source: ItemSource::Box {
                     covariance_m2: PlaneCovariance::isotropic(self.box_variance_m2),
@@ -551,6 +552,7 @@ mod tests {
             camera: CameraId::new("a").expect("a slug"),
             time: Timestamp::from_second(START_S).expect("in range"),
             target_id: Some(TargetId::new("walker").expect("a name")),
+            tracked_as: None,
             position: Position::new(8.0, 47.0).expect("valid"),
             source: ItemSource::Fix { variance_m2: 4.0 },
         };

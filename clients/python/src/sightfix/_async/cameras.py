@@ -53,7 +53,7 @@ class Cameras:
         await self._transport.send(delete(path("cameras", camera_id)))
 
     async def learning(self, camera_id: str) -> Learning:
-        """What a camera without a model has recorded to learn from, and what is missing."""
+        """The recording that a camera without a model learns from, and what is missing in it."""
         return await self._transport.json(get(path("cameras", camera_id, "learning")), Learning)
 
     async def picture(self, camera_id: str) -> bytes | None:

@@ -49,7 +49,7 @@ class Sites:
         return (await self._transport.json(get(path("sites", site_id, "tracks")), WorldTracks)).items
 
     async def watch(self, site_id: str, *, resume_after: str | None = None) -> AsyncGenerator[SiteEvent, None]:
-        """What happens at a site from now on, or after the event of an id that was read before.
+        """The events of a site from now on, or after the event of an id that was read before.
 
         Ends when the site is deleted or the server shuts down.
         """

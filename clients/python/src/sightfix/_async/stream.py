@@ -46,7 +46,7 @@ CHANNEL_OPTIONS = [
 
 @dataclass(frozen=True, kw_only=True)
 class StreamOptions:
-    """What a stream is for, and how much it buffers."""
+    """The purpose and the buffers of a stream."""
 
     camera_id: str
     client_name: str
@@ -57,7 +57,7 @@ class StreamOptions:
     retry: RetryPolicy
     """Applies once the stream was open; before that, the one of the client."""
     keeps_all_answers: bool
-    """Whether `send` waits while answers are not read; else the oldest ones are dropped."""
+    """True if `send` waits while answers are not read; else the oldest ones are dropped."""
 
 
 def open_channel(settings: Settings, server: str) -> grpc.aio.Channel:

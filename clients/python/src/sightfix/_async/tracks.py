@@ -56,7 +56,7 @@ class Tracks:
         return await self._transport.json(request, FollowedObservations)
 
     async def watch(self, camera_id: str) -> AsyncGenerator[CameraEvent, None]:
-        """What happens on a camera from now on: measured targets, a moved camera, lost events.
+        """The events of a camera from now on: measured targets, a moved camera, lost events.
 
         Ends when the camera is deleted or the server shuts down.
         """

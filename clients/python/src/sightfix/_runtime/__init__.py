@@ -1,1 +1,1 @@
-"""What the asynchronous and the synchronous client do differently; the rest of them is one code."""
+"""The differences of the asynchronous and the synchronous client; the rest of them is one code."""

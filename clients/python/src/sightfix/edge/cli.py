@@ -84,7 +84,7 @@ def running_parser() -> argparse.ArgumentParser:
     parser.add_argument("--preview", type=int, metavar="PORT", help="show the boxes on http://127.0.0.1:PORT/")
     parser.add_argument("--record", type=Path, metavar="FILE", help="write the boxes to a CSV file")
     parser.add_argument(
-        "--benchmark", type=int, metavar="FRAMES", help="measure so many frames by stage; nothing is sent"
+        "--benchmark", type=int, metavar="FRAMES", help="measure this number of frames by stage; nothing is sent"
     )
     add_common(parser)
     return parser
@@ -233,7 +233,7 @@ def until(stopped: threading.Event, frames: Iterable[Frame]) -> Iterator[Frame]:
 def outputs_of(
     options: argparse.Namespace, first: Frame, stopped: threading.Event, stack: ExitStack
 ) -> Iterator[Output]:
-    """What was asked for; the stack closes it. There is no stream if the event comes before the server is reached."""
+    """The requested outputs; the stack closes them. There is no stream if the event comes before the server answers."""
     if options.record is not None:
         yield closing(stack, Recorder(options.record))
     if options.preview is not None:

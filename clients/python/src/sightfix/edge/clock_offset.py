@@ -30,7 +30,7 @@ MAX_GAP_S = 2.5
 """Fixes are joined over at most this gap, boxes of a target likewise."""
 LEAST_ROWS = 60
 LEAST_SHARE = 0.7
-"""Of the rows that any offset has."""
+"""Share of the rows that any offset has."""
 OTHER_PEAK_S = 5.0
 """Offsets farther away are another answer."""
 EARTH_M_PER_DEG = 111_320.0
@@ -50,7 +50,7 @@ class ClockOffset:
 
     @property
     def is_sure(self) -> bool:
-        """Whether the offset may be relied on: within half a second, and without a rival."""
+        """True if the offset is reliable: within half a second, and no other offset fits as well."""
         return 2 * self.sigma_s <= 1.0 and self.margin >= np.log(100.0)
 
 

@@ -11,7 +11,7 @@ from sightfix.edge.values import Frame
 LOG = logging.getLogger(__name__)
 
 REPORT_FRAMES = 500
-"""Dropped frames are reported once in so many frames."""
+"""Dropped frames are reported once in this number of frames."""
 
 
 class LatestFrames:

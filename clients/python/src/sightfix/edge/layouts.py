@@ -42,7 +42,7 @@ class Layout:
     decode: Callable[[dict[str, Array], tuple[int, int]], Candidates]
     """From outputs by name, and width and height of the input in px."""
     has_duplicates: bool = True
-    """Whether non-maximum suppression is still to be done."""
+    """True if non-maximum suppression is still to be done."""
 
 
 def corners(centred: Array) -> Array:

@@ -22,9 +22,9 @@ LOG = logging.getLogger(__name__)
 TimedBox = tuple[datetime, TrackedBox]
 
 ALONE_SHARE = 0.98
-"""Of the frames with boxes, those with a single one, from which on one walker is taken to be in the video."""
+"""Share of the frames with boxes that have a single one; from it on, one walker is taken to be in the video."""
 LARGEST_MATCH_WINDOW_S = 30.0
-"""Of the server's search for whose boxes are whose, where several people are in view."""
+"""Largest window of the server's search for whose boxes are whose, where several people are in view."""
 WALK_AGAIN = (
     "walk again: stop for some 15 s at two places, turn at corners, and cross the view near and far from the camera"
 )
@@ -36,13 +36,13 @@ class LearnError(Exception):
 
 @dataclass(frozen=True)
 class Learnt:
-    """What a recording has yielded."""
+    """The results of a recording."""
 
     paired: PairedSamples
     run: TrainingRun
     model: ModelVersion | None
     is_active: bool
-    """Whether the new version answers now."""
+    """True if the new version answers now."""
 
     def lines(self) -> list[str]:
         """The outcome, the accuracy, and what would improve it, for people."""
@@ -103,7 +103,7 @@ def learn(client: Client, camera_id: str, collected: Collector, track: Track, *,
 
 
 def shows_one_walker(boxes: Sequence[TimedBox]) -> bool:
-    """Whether hardly any frame has two boxes."""
+    """True if hardly any frame has two boxes."""
     counts = [len(list(group)) for _, group in groupby(boxes, key=lambda it: it[0])]
     return counts.count(1) >= ALONE_SHARE * len(counts)
 

@@ -30,7 +30,7 @@ class Letterbox:
     image_width_px: int
     image_height_px: int
     width_px: int
-    """Of the input, as the height."""
+    """Width of the network's input."""
     height_px: int
     fit: Fit
 

@@ -17,7 +17,7 @@ FOREGROUND = 255
 BORDER_PX = 2.0
 """A side this close to the border lies on it."""
 WARNING_FRAMES = 30
-"""A warning is about so many frames."""
+"""A warning is about this number of frames."""
 VAR_THRESHOLD = 16.0
 """Squared Mahalanobis distance from which a pixel is foreground."""
 SHADOW_THRESHOLD = 0.5
@@ -41,7 +41,7 @@ THUMBNAIL_PX = (320, 180)
 MOVED_SHARE = 0.0025
 """Shift of the view, as a share of its width, from which the camera has moved: 3 px of 1280."""
 RESTING_FACTOR = 6
-"""A box that stays where it is for so many times the history belongs to the background."""
+"""A box that stays where it is for this multiple of the history belongs to the background."""
 MIN_REACH_PX = 16.0
 """Least width from which the reach of a box at rest is taken."""
 
@@ -55,7 +55,7 @@ CROWDED = (
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions:
-    """What counts as a moving target."""
+    """The criteria of a moving target."""
 
     class_: str = "person"
     """Class of all boxes: motion alone does not tell."""
@@ -68,7 +68,7 @@ class MotionOptions:
     max_width_px: int = 960
     """Wider images are reduced."""
     crowd_boxes: int = 12
-    """From so many boxes on neighbours merge too often."""
+    """From this number of boxes on, neighbours merge too often."""
 
 
 @dataclass(slots=True)
@@ -107,7 +107,7 @@ class MotionDetector:
 
     @property
     def warning(self) -> str | None:
-        """What most of the latest frames suffer from."""
+        """The fault of most of the latest frames."""
         signs = [sign for sign in self._signs if sign is not None]
         return max(set(signs), key=signs.count) if 2 * len(signs) > WARNING_FRAMES else None
 
@@ -139,7 +139,7 @@ class MotionDetector:
         return box.width_px >= self._options.min_width_px and box.height_px >= self._options.min_height_px
 
     def _sign(self, boxes: list[Box], speckled_share: float) -> str | None:
-        """What is wrong with a frame."""
+        """The fault of a frame."""
         if self._shift_share > MOVED_SHARE:
             return CAMERA_MOVES
         if speckled_share > SPECKLED_SHARE:
@@ -209,7 +209,7 @@ def merged(boxes: list[Box]) -> list[Box]:
 
 
 def is_part(box: Box, other: Box) -> bool:
-    """Whether a smaller box belongs to a box: nearly below or above it, or overlapping it."""
+    """True if a smaller box belongs to a box: nearly below or above it, or overlapping it."""
     overlap_px = min(box.right_px, other.right_px) - max(box.left_px, other.left_px)
     gap_px = max(box.top_px, other.top_px) - min(box.bottom_px, other.bottom_px)
     narrow, wide = sorted((box, other), key=lambda it: it.width_px)
@@ -246,7 +246,7 @@ def still_resting(before: list[Resting], boxes: list[Box]) -> list[Resting]:
 
 
 def is_at_rest(before: Box, box: Box) -> bool:
-    """Whether the foot point has moved by less than a quarter of the width."""
+    """True if the foot point has moved by less than a quarter of the width."""
     middles_px = (it.left_px + it.width_px / 2 for it in (before, box))
     reach_px = 0.25 * max(before.width_px, MIN_REACH_PX)
     return abs(next(middles_px) - next(middles_px)) < reach_px and abs(before.bottom_px - box.bottom_px) < reach_px

@@ -27,7 +27,7 @@ class ModelError(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions:
-    """What is not to be seen from the graph, and what is wanted of its boxes."""
+    """Facts that the graph does not contain, and the selection of its boxes."""
 
     layout: str | None = None
     """A name of `LAYOUTS`; by default recognised."""
@@ -39,7 +39,7 @@ class ModelOptions:
     """Classes that are wanted; none means all."""
     min_score: float = 0.4
     max_overlap: float = 0.6
-    """Of two boxes of one class with a larger IoU, the one with the lower score is dropped."""
+    """If two boxes of one class have a larger IoU, the one with the lower score is dropped."""
     threads: int = 1
 
 

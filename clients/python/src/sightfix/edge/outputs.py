@@ -1,4 +1,4 @@
-"""What becomes of the boxes: they are streamed to a server, recorded, and drawn for a preview."""
+"""The outputs of the boxes: they are streamed to a server, recorded, and drawn for a preview."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LOG = logging.getLogger(__name__)
 SERVER_RETRY = RetryPolicy(attempts=2**31, initial_delay_s=0.5, max_delay_s=30.0)
 BUFFERED_BOXES = 4096
 LONGEST_SILENCE_S = 10.0
-"""Of the server at the end of a stream, after which its answers are no longer waited for."""
+"""Longest silence of the server at the end of a stream; then its answers are no longer waited for."""
 LARGEST_STILL_BYTES = 2 * 2**20
 STILL_QUALITIES = (90, 75, 50, 25)
 

@@ -21,7 +21,7 @@ from sightfix.edge.values import Frame
 LOG = logging.getLogger(__name__)
 
 Sleep = Callable[[float], bool | None]
-"""Waits for so many seconds; returns True if there is nothing more to wait for."""
+"""Waits for a number of seconds; returns True if there is nothing more to wait for."""
 SOURCE_RETRY = RetryPolicy(attempts=2**31, initial_delay_s=0.5, max_delay_s=30.0)
 PICTURE_ENDINGS = (".jpg", ".jpeg", ".png")
 LARGEST_PICTURE_BYTES = 32 * 2**20
@@ -60,12 +60,12 @@ class SourceOptions:
 
     @property
     def is_live(self) -> bool:
-        """Whether frames come in real time, from a source that may come back after it has ended."""
+        """True if frames come in real time, from a source that may come back after it has ended."""
         return self.address.startswith("/dev/") or "://" in self.address
 
     @property
     def is_picture(self) -> bool:
-        """Whether the address is that of a picture, which is requested again and again."""
+        """True if the address is that of a picture, which is requested again and again."""
         parts = urlsplit(self.address)
         return parts.scheme in ("http", "https") and PurePosixPath(parts.path).suffix.lower() in PICTURE_ENDINGS
 
@@ -104,7 +104,7 @@ def reopened(opened: Callable[[], Iterator[Frame]], retry: RetryPolicy, sleep: S
 
 
 def thinned(frames: Iterable[Frame], max_frames_per_s: float) -> Iterator[Frame]:
-    """Frames with increasing times, at most so many per second; times go back only after a clock that was set."""
+    """Frames with increasing times, with a limit per second; times go back only after a clock that was set."""
     interval_s = EARLIEST_FRAME_SHARE / max_frames_per_s
     latest: datetime | None = None
     for frame in frames:
@@ -158,7 +158,7 @@ class FrameTimes:
         self._zero: datetime | None = None
         """The instant at which presentation times begin, if it is known."""
         self._is_believed: bool | None = None
-        """Whether the latest report of the sender was believed; None before the first."""
+        """True if the latest report of the sender was believed; None before the first."""
         if not options.is_live:
             start = options.start or creation_time(container)
             if start is None:
@@ -193,7 +193,7 @@ class FrameTimes:
 
 
 def creation_time(container: Any) -> datetime | None:
-    """What a file says of its creation, if it says it with an offset."""
+    """The time of creation that a file states, if it has an offset."""
     text = container.metadata.get("creation_time")
     try:
         time = datetime.fromisoformat(text) if text else None

@@ -21,7 +21,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """What a detector found, in pixels of the frame."""
+    """A detection, in pixels of the frame."""
 
     left_px: float
     top_px: float

@@ -1,4 +1,4 @@
-//! Whether a box looks like those of training at its place, and which box would.
+//! The plausibility of a box at its place, by the boxes of training, and the box that would be plausible.
 //!
 //! In each cell of the image, log width and log height are regressed on the foot's place (Bayesian linear
 //! regression; the slopes' prior is the regression over all cells). A box's deviation from it, in units of
@@ -43,7 +43,7 @@ pub(crate) struct Cell {
     pub(crate) leverage: [f64; 6],
 }
 
-/// All cells.
+/// The regressions of all cells.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct BoxPlausibility {
     /// Centre and unit of the foot, px.
@@ -68,12 +68,14 @@ pub(crate) struct Deviation {
     widen: f64,
 }
 
-/// The running mean of how a target's boxes deviate from those of training: one per target, kept by the
-/// caller between its boxes.
+/// Running means of how a target's boxes deviate from those of training, and of the probability that its foot is hidden:
+/// one per target, kept by the caller between its boxes.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct RecentBoxes {
     mean: [f64; 2],
     count: u32,
+    /// Exponential mean, over as many boxes, of the probability that the foot is hidden.
+    pub(super) hidden: f64,
 }
 
 impl RecentBoxes {

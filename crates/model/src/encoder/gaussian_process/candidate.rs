@@ -21,7 +21,7 @@ const ROWS_PER_INDUCING: usize = 5;
 /// Scale of the sides' coefficients where only the foot counts.
 const NO_SIDES: f64 = 1e-4;
 
-/// What a map is made of.
+/// The form of a map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum MapForm {
     /// The foot's homography alone.
@@ -244,7 +244,7 @@ impl<'a> Draft<'a> {
 
     /// The posterior of all rows and without each group.
     ///
-    /// Groups' Gram matrices add up, so leaving one out is a subtraction; where a target's spells are
+    /// Groups' Gram matrices add up, so leaving one out is a subtraction; where a target's segments are
     /// groups of their own, each is whitened on its own.
     pub(crate) fn solve(self, parameters: &Hyperparameters, grouping: &Grouping) -> Option<MapCandidate> {
         let inducing = self.inducing(MAX_INDUCING);

@@ -64,7 +64,7 @@ fn put(trained: &Trained, parts: &mut ModelParts) {
     put_network(&mut parts.tensors, PREFIX, &trained.shape, &trained.parameters);
 }
 
-/// The auto-encoder of a model; `None` for models of earlier releases.
+/// The auto-encoder of a model; `None` where the fit was not the last one.
 ///
 /// # Errors
 /// Names the tensor that is missing or cannot be used.

@@ -29,7 +29,7 @@ pub(crate) const SHARED_BIAS_SHARE: f64 = 0.1;
 const PRIOR_FREEDOM: f64 = 4.0;
 /// Coefficients of a homography per axis, which as many independent fixes determine.
 const MAP_COEFFICIENTS: f64 = 4.0;
-/// Of the normal distribution.
+/// The least inverse degrees of freedom, those of the normal distribution.
 const MIN_INVERSE_FREEDOM: f64 = 1e-6;
 /// Share by which the miss to the own rows may exceed that to left-out ones, and standard errors of the mean square of
 /// independent fixes beside it.
@@ -38,7 +38,7 @@ const OWN_MISS_ERRORS: f64 = 2.0;
 /// Least variance of the fixes about the homography, m2.
 const MIN_SCATTER_M2: f64 = 1e-6;
 
-/// What a fit found out, for people.
+/// The findings of a fit, for people.
 #[derive(Debug, Clone)]
 pub(crate) struct FitReport {
     pub(crate) parameters: Hyperparameters,
@@ -60,13 +60,13 @@ pub(crate) struct FitReport {
     pub(crate) freedom: f64,
     /// Mean squared miss per axis of the solution to the fixes that it was fitted to, bounded as those to left-out ones, m2.
     pub(crate) own_m2: f64,
-    /// Of the mixture: mean squared miss per axis to left-out fixes, m2, and the share of these inside
+    /// Error of the mixture: mean squared miss per axis to left-out fixes, m2, and the share of these inside
     /// the radius that map and receiver state together.
     pub(crate) held_out_m2: f64,
     pub(crate) held_out_coverage: f64,
 }
 
-/// What is known beside the rows.
+/// The settings of a fit besides the rows.
 #[derive(Debug, Clone)]
 pub(crate) struct FitSettings {
     /// Standard deviation per axis of the bias that all fixes have in common, which no training row can show,
@@ -76,7 +76,7 @@ pub(crate) struct FitSettings {
     pub(crate) white_share: f64,
     /// Error variance per axis of the receivers, m2, where it is known.
     pub(crate) receiver_m2: Option<f64>,
-    /// Of the bootstrap that weighs the candidates.
+    /// Seed of the bootstrap that weighs the candidates.
     pub(crate) seed: u64,
     /// Geometry by the heights of boxes, if the image size is known.
     pub(crate) upright: Option<UprightCamera>,
@@ -244,7 +244,7 @@ fn mixed_residual(candidates: &[MapCandidate], weights: &[f64], row: usize) -> [
     sum_m
 }
 
-/// What is known of the bias that all fixes have in common, which is part of every answer's error whatever
+/// The knowledge of the bias that all fixes have in common, which is part of every answer's error whatever
 /// the number of rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum BiasPrior {

@@ -87,7 +87,7 @@ impl FittedFootMap {
         Some(Predictor::new(vec![map], InputScales::of_rows(&rows.boxes), stated))
     }
 
-    /// The parts of a model in the plane of its training rows, with an auto-encoder of so many epochs.
+    /// The parts of a model in the plane of its training rows, with an auto-encoder of `epochs` epochs.
     ///
     /// # Errors
     /// [`FitError::Unusable`] if the covariance is none; [`FitError::Cancelled`].

@@ -7,7 +7,7 @@ use crate::encoder::features::features_of;
 
 /// Standard deviation of the foot of a box, px.
 const FOOT_NOISE_PX: f64 = 3.0;
-/// Ground points beyond so many times the camera's height are left out: their distance is not determined.
+/// Ground points beyond this multiple of the camera's height are left out: their distance is not determined.
 const MAX_DISTANCE_HEIGHTS: f64 = 40.0;
 
 /// An upright pinhole camera above flat ground, without place and direction.
@@ -48,7 +48,7 @@ impl GroundCamera {
         starts.into_iter().map(|parameters| Self { camera: camera.clone(), parameters }).collect()
     }
 
-    /// Whether targets of that class are about equally tall, so that their boxes tell the scale.
+    /// True if targets of that class are about equally tall, so that their boxes tell the scale.
     #[must_use]
     pub fn knows_height_of(class: &TargetClass) -> bool {
         super::target_height_m(std::iter::once(Some(class))).1 < 0.5

@@ -3,9 +3,12 @@
 //! Hypotheses about a box (left, top, width, height): it is whole; a share x of the target's height is hidden below it,
 //! so the target's box has the height h / (1 - x) and its foot is lower; or it is of anything. The densities of log width
 //! and log height at the hypothetical foot are those of the training boxes (`box_plausibility`), which have the heights
-//! of different targets in them, with x uniform. Bayes' rule gives the probability that the foot is hidden.
+//! of different targets in them, with x uniform. Bayes' rule gives the probability that the foot is hidden. What hides a
+//! foot mostly hides it in the next box, too, so the prior probability of a target's next box is the mean of what its latest
+//! boxes tell one by one. Otherwise the boxes of a hidden foot that look whole by chance would tell its position alone, as
+//! they state the smallest errors. What they tell is not multiplied, for a short target is short in every box.
 
-use super::box_plausibility::BoxPlausibility;
+use super::box_plausibility::{BoxPlausibility, RECENT_BOXES, RecentBoxes};
 use super::projective_mean::Box4;
 use crate::domain::BoundingBox;
 use crate::encoder::features::features_of;
@@ -34,17 +37,28 @@ pub struct HiddenFoot {
 }
 
 impl HiddenFoot {
-    /// `None` for a box that is most probably whole.
+    /// `None` for a box that is most probably whole. `recent` is that of its target and takes the box in.
     #[inline]
-    pub(crate) fn of(bounding_box: &BoundingBox, plausibility: &BoxPlausibility) -> Option<Self> {
+    pub(crate) fn of(
+        bounding_box: &BoundingBox,
+        plausibility: &BoxPlausibility,
+        recent: Option<&mut RecentBoxes>,
+    ) -> Option<Self> {
+        let prior = recent.as_ref().map_or(HIDDEN, |recent| recent.hidden.max(HIDDEN));
         let sides = features_of(bounding_box);
         let seen = plausibility.deviation(&sides);
-        if seen.normalized[1] > -WHOLE_SIGMAS {
-            return None;
+        let is_whole = prior <= HIDDEN && seen.normalized[1] > -WHOLE_SIGMAS;
+        let density = (!is_whole).then(|| hidden_density(plausibility, &sides));
+        let posterior = |prior: f64| {
+            let hidden = prior * density.map_or(0.0, |(density, ..)| density);
+            let whole = (1.0 - prior - ANYTHING) * plausibility.density(&seen);
+            hidden / (hidden + whole + ANYTHING * ANYTHING_DENSITY)
+        };
+        if let Some(recent) = recent {
+            recent.hidden += (posterior(HIDDEN) - recent.hidden) / RECENT_BOXES as f64;
         }
-        let (density, mean, variance) = hidden_density(plausibility, &sides);
-        let (hidden, whole) = (HIDDEN * density, (1.0 - HIDDEN - ANYTHING) * plausibility.density(&seen));
-        let probability = hidden / (hidden + whole + ANYTHING * ANYTHING_DENSITY);
+        let (_, mean, variance) = density?;
+        let probability = posterior(prior);
         if probability < LEAST_PROBABILITY {
             return None;
         }

@@ -88,7 +88,7 @@ pub(crate) struct Priors {
     sigmas: Logs,
     /// Median interval between neighbouring fixes of a receiver, s.
     interval_s: f64,
-    /// Whether the slow part is stated from outside, not derived from the short one.
+    /// True if the slow part is stated from outside, not derived from the short one.
     session_is_stated: bool,
     /// Standard deviation of white and short part together by what is known of such receivers, m, and the weight of that.
     receiver: (f64, f64),
@@ -150,7 +150,7 @@ impl Priors {
         (logs - centre).component_div(&self.sigmas).norm_squared() + self.receiver_penalty(logs)
     }
 
-    /// Of a logarithm with a t distribution: it holds phones together, and lets go of a much better receiver.
+    /// Penalty of a logarithm with a t distribution: it holds phones together, and lets go of a much better receiver.
     fn receiver_penalty(&self, logs: &Logs) -> f64 {
         let (sigma_m, weight) = self.receiver;
         let stated_m = logs[0].exp().hypot(logs[1].exp());
@@ -159,7 +159,7 @@ impl Priors {
     }
 }
 
-/// What the likelihood is computed from: some rows, linearised.
+/// The input of the likelihood: some rows, linearised.
 #[derive(Debug)]
 pub(crate) struct LikelihoodRows<'a> {
     pub(crate) epochs: &'a [Epoch],

@@ -1,4 +1,4 @@
-//! What left-out groups say: the weight of each candidate, and whether the stated error holds.
+//! Leave-group-out validation: the weight of each candidate, and a check of the stated error.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -11,7 +11,7 @@ use super::noise::{Epoch, ReceiverNoise};
 use super::sessions::weighted_mean;
 
 const BOOTSTRAP_DRAWS: usize = 500;
-/// A squared miss counts no more than so many variances of the receiver.
+/// A squared miss counts at most this number of variances of the receiver.
 const BOUND: f64 = 10.0;
 /// 95 % point of chi-square with two degrees of freedom.
 const CHI_SQUARE_95: f64 = 5.991;
@@ -27,7 +27,7 @@ struct LeftOutRow {
     map_m2: f64,
 }
 
-/// What left-out rows say of the mixture.
+/// The calibration of the mixture on left-out rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct LeftOutCalibration {
     /// Factor on the map's variance, at least 1.

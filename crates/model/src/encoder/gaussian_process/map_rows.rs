@@ -1,4 +1,4 @@
-//! What a fit learns from, and the rows that it leaves out as gross errors.
+//! The training rows of a fit, and the rows that it leaves out as gross errors.
 
 use super::noise::Epoch;
 use super::projective_mean::{Box4, ProjectiveMean};

@@ -54,7 +54,7 @@ impl ReceiverNoise {
 pub(crate) struct Epoch {
     /// Seconds since any fixed instant.
     pub(crate) time_s: f64,
-    /// Receiver, or receiver and spell where spells count as independent.
+    /// Receiver, or receiver and segment where segments count as independent.
     pub(crate) sequence: u32,
 }
 

@@ -109,7 +109,7 @@ impl TangentPrior {
 /// Mean and covariance of all coefficients.
 #[derive(Debug, Clone)]
 pub(crate) struct Posterior {
-    /// Of the tangent.
+    /// Coefficients of the tangent.
     pub(crate) tangent: DVector<f64>,
     /// Kernel weights of east and of north.
     pub(crate) kernel: [DVector<f64>; 2],

@@ -19,12 +19,12 @@ pub(crate) const MAX_RANK: usize = 40;
 const MIN_DETERMINED: f64 = 0.02;
 /// Points of the radius' table, between one and two degrees of freedom.
 pub(crate) const QUANTILES: usize = 5;
-/// Of an implausible box: the answer moves by this share of its weight toward that of the plausible box.
+/// For an implausible box the answer moves by this share of its weight toward that of the plausible box.
 pub(crate) const SHRINKAGE: f64 = 0.5;
 /// Share of the squared distance between its edges and the plausible ones that each edge may be wrong by.
 pub(crate) const UNEXPLAINED_SHARE: f64 = 0.2;
 
-/// What is stated beside the maps.
+/// Parts of the stated error that are not in the maps, and the test of boxes.
 pub(crate) struct Stated {
     pub(crate) edge_px2: [f64; 16],
     pub(crate) shared_bias_m2: f64,
@@ -58,7 +58,7 @@ pub(crate) struct PositionMap {
     pub(crate) basis: Vec<f64>,
     /// Share of each direction's prior variance that training takes away.
     pub(crate) determined: Vec<f64>,
-    /// What the kernel takes over from the tangent: per axis, `rank` rows of 14.
+    /// The part that the kernel takes over from the tangent: per axis, `rank` rows of 14.
     pub(crate) absorbed: [Vec<f64>; 2],
     /// Lower Cholesky factor of the tangent coefficients' covariance, 14 rows of 14.
     pub(crate) tangent_factor: Vec<f64>,
@@ -93,13 +93,13 @@ pub(crate) struct MapPrediction {
     /// Radius that holds the truth with 95 %, in standard deviations per axis (the root of half the
     /// covariance's trace).
     pub(crate) r95_scale: f64,
-    /// Of it, the part that is new with each box: east, cross, north, m2.
+    /// The part of it that is new with each box: east, cross, north, m2.
     pub(crate) box_noise_m2: [f64; 3],
     /// How the box deviates from those of training.
     pub(crate) deviation: Deviation,
 }
 
-/// What one map says of one box.
+/// The terms of one map for one box.
 struct MapTerms {
     evaluation: EvaluatedMean,
     q: [f64; MAX_RANK],
@@ -108,19 +108,19 @@ struct MapTerms {
     jacobian: [[f64; 4]; 2],
 }
 
-/// What the map's covariance depends on.
+/// The directions that the map's covariance depends on.
 struct Directions {
-    /// Of the residual, m2.
+    /// Prior variance of the residual, m2.
     prior_m2: f64,
     q: [f64; MAX_RANK],
     /// Derivatives of east and north by the coefficients.
     tangent: [[f64; COEFFICIENTS]; 2],
 }
 
-/// What all maps say of one box.
+/// The mixture of all maps for one box.
 pub(super) struct Mixture {
     pub(super) position_m: [f64; 2],
-    /// Of the maps and of what they differ by, m2.
+    /// Covariance of the maps and of their differences, m2.
     pub(super) map_m2: [f64; 3],
     /// Derivatives by left, top, right, bottom, m per px.
     pub(super) by_edge: [[f64; 4]; 2],

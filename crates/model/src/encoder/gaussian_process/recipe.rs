@@ -29,7 +29,7 @@ const TARGET_HEIGHTS: [(&[&str], (f64, f64)); 3] =
 pub(crate) struct Settings<'a> {
     /// Error variance per axis of the receiver, m2.
     pub(crate) e_gnss_m2: f64,
-    /// Whether that was estimated, and may be replaced by the estimate of this recipe.
+    /// True if that was estimated, and may be replaced by the estimate of this recipe.
     pub(crate) e_gnss_is_estimated: bool,
     /// Standard deviation per axis of the bias that all fixes have in common, m, if known.
     pub(crate) gnss_bias_sigma_m: Option<f64>,
@@ -210,7 +210,7 @@ fn note(report: &FitReport, phase: &mut Phase<'_, '_>) -> Result<(), FitError> {
 #[derive(Debug, Clone)]
 pub(crate) struct GaussianProcessEncoder {
     pub(crate) predictor: Predictor,
-    /// Models of earlier releases have none.
+    /// Fits of parts of the rows have none.
     pub(crate) auto_encoder: Option<AutoEncoder>,
 }
 
@@ -218,9 +218,9 @@ pub(crate) struct GaussianProcessEncoder {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct BoxEstimate {
     pub(crate) encoded: Encoded,
-    /// Of the position's error, m2.
+    /// Covariance of the position's error, m2.
     pub(crate) covariance: PlaneCovariance,
-    /// Of it, the part that is new with each box, m2.
+    /// The part of it that is new with each box, m2.
     pub(crate) box_noise: PlaneCovariance,
     /// Radius of 95 % in standard deviations.
     pub(crate) r95_scale: f64,

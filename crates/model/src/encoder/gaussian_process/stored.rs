@@ -149,10 +149,7 @@ impl PositionMap {
             map.rank = rank;
             map.basis = f64s(&tensors.take_f32(&name("basis"), &[points, rank])?);
             map.determined = f64s(&tensors.take_f32(&name("determined"), &[rank])?);
-            map.point_weights = halves(&match tensors.rows(&name("point_weights")) {
-                Some(_) => tensors.take_f64(&name("point_weights"), &[2, points])?,
-                None => of_directions(&map, &f64s(&tensors.take_f32(&name("weights"), &[2, rank])?)),
-            });
+            map.point_weights = halves(&tensors.take_f64(&name("point_weights"), &[2, points])?);
             map.absorbed = halves(&f64s(&tensors.take_f32(&name("absorbed"), &[2, rank, COEFFICIENTS])?));
         }
         let deviations = tensors.rows(&name("deviations")).unwrap_or(0);
@@ -213,15 +210,6 @@ impl BoxPlausibility {
             recent_whitening: [limits[6], limits[7], limits[8]],
         })
     }
-}
-
-/// Weights per inducing point from those per direction, which an earlier format has.
-fn of_directions(map: &PositionMap, weights: &[f64]) -> Vec<f64> {
-    let at_point =
-        |own: &[f64], weights: &[f64]| own.iter().zip(weights).map(|(own, weight)| own * weight).sum();
-    let of_axis =
-        |weights: &[f64]| map.basis.chunks_exact(map.rank).map(|own| at_point(own, weights)).collect();
-    weights.chunks_exact(map.rank).flat_map(|weights| -> Vec<f64> { of_axis(weights) }).collect()
 }
 
 fn f32s(values: &[f64]) -> Vec<f32> {

@@ -200,7 +200,7 @@ fn a_stored_model_answers_as_the_fitted_one_and_is_the_same_for_the_same_rows() 
     }
 }
 
-/// What two answers share is no part of the error of their distance.
+/// Errors that two answers share are no part of the error of their distance.
 #[test]
 fn the_error_of_a_distance_vanishes_with_the_distance_and_is_bounded_by_those_of_its_ends() {
     let (rows, tests) = walkers(4001, 8, 90, 1.0);
@@ -378,7 +378,7 @@ fn a_receiver_whose_error_is_white_keeps_no_bias() {
     let (_, report) = fit(&rows, &settings).expect("rows that determine a map");
     let receiver = report.receiver;
     println!("{receiver:?}");
-    // Of 29.5 m per axis.
+    // Parts of an error of 29.5 m per axis.
     assert!(receiver.session_m2.sqrt() < 1.5, "{receiver:?}");
     assert!(receiver.white_m2.sqrt() > 25.0, "{receiver:?}");
 }

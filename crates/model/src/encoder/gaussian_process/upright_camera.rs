@@ -17,7 +17,7 @@ use crate::statistics::median;
 /// camera height (m), yaw (rad), east and north of the camera less the centre of the positions (m), log
 /// aspect ratio of the pixels.
 pub(crate) const PARAMETERS: usize = 9;
-/// Of the height ratio, the one that a homography does not hang on.
+/// Index of the height ratio, the one that a homography does not depend on.
 const RATIO: usize = 3;
 /// Parameters that boxes alone tell of.
 const OF_BOXES: usize = 4;
@@ -39,13 +39,13 @@ const BOXES_PER_TARGET: usize = 20;
 const MAX_TARGETS: usize = 500;
 /// Boxes nearer to the border are cut by it, px.
 const BORDER_PX: f64 = 3.0;
-/// What a real camera departs from the ideal one by: standard deviations of log focal length, pitch, roll
+/// Differences of a real camera from the ideal one: standard deviations of log focal length, pitch, roll
 /// and log height ratio that no number of boxes goes below.
 const MODEL_ERROR: [f64; OF_BOXES] = [0.02, 0.003, 0.004, 0.01];
 /// Prior standard deviation of the log aspect ratio; it also absorbs lens distortion.
 const ASPECT_PRIOR: f64 = 0.02;
 const ROUNDS: usize = 25;
-/// Of numerical derivatives.
+/// Step of numerical derivatives.
 const DIFFERENCE: f64 = 1e-5;
 /// A Gauss-Newton step changes angles (rad) and logarithms by at most so much.
 const MAX_STEP: f64 = 0.2;
@@ -65,7 +65,7 @@ pub(crate) struct UprightCamera {
     target_height: (f64, f64),
 }
 
-/// What boxes and priors say about a set of parameters.
+/// The evidence of boxes and priors about a set of parameters.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Evidence {
     /// Half the misfit, gradient of minus it, and information.
@@ -236,7 +236,7 @@ impl UprightCamera {
         Some(moved)
     }
 
-    /// What boxes and priors say; `None` where a box is beyond the horizon.
+    /// Returns the evidence of boxes and priors; `None` where a box is beyond the horizon.
     pub(crate) fn evidence(&self, parameters: &Parameters) -> Option<Evidence> {
         let mut evidence = self.prior(parameters);
         for target in &self.targets {

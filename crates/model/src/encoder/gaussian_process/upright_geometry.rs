@@ -1,4 +1,4 @@
-//! What the heights of boxes say of a camera's homography, for fits of several cameras: a prior of its coefficients.
+//! A prior of the coefficients of a camera's homography from the heights of boxes, for fits of several cameras.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -44,8 +44,8 @@ pub(crate) struct UprightGeometry {
 }
 
 impl UprightGeometry {
-    /// Of the cameras that suit the boxes the one that places feet nearest to their positions, with its homography in
-    /// the scales of `mean`.
+    /// Selects, among the cameras that suit the boxes, the one that places feet nearest to their positions. Returns it
+    /// with its homography in the scales of `mean`.
     pub(crate) fn new(
         UprightStarts { camera, starts }: &UprightStarts,
         mean: &ProjectiveMean,

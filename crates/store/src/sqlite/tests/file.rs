@@ -7,7 +7,7 @@ use crate::domain::{Durability, NewCamera};
 use crate::tests::{Fixture, at, id, metadata, options, run_id, sample};
 use crate::{SampleFilter, Store};
 
-/// What a process killed now would leave on the disk.
+/// A copy of what a process killed now would leave on the disk.
 fn crashed_copy(folder: &Path) -> TempDir {
     let copy = TempDir::new().expect("a folder");
     for name in ["sightfix.db", "sightfix.db-wal"] {

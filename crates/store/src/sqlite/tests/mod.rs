@@ -1,4 +1,4 @@
-//! What only the store of a folder has: its file and its one writing connection.
+//! Tests of the store of a folder alone: its file and its one writing connection.
 
 mod file;
 mod writer;

@@ -1,0 +1,75 @@
+// Where the boxes of a new camera come from: what each source asks for, and its parts of the requests.
+import { slugOf } from './format';
+import type { JsonMapping } from './json_mapping';
+import type { TextKey } from './texts';
+
+export interface BoxSource {
+  key: string;
+  text: TextKey;
+  help: TextKey;
+  /** Addresses that its connection may have, the first is proposed; none where no connection is made. */
+  addresses: string[];
+  format?: string;
+  /** Topics that are proposed. */
+  topics?: string;
+  /** Whether its boxes are shares of the image, which need the image's size. */
+  needsSize?: boolean;
+  mapping?: JsonMapping;
+}
+
+const MQTT = 'mqtt://broker:1883';
+
+/** AXIS scene metadata. */
+const AXIS: JsonMapping = {
+  items: '/frame/observations',
+  time: '/frame/timestamp',
+  target: '/track_id',
+  class: '/class/type',
+  score: '/class/score',
+  bounding_box: { form: 'corners', unit: 'share', sides: ['/bounding_box/left', '/bounding_box/top', '/bounding_box/right', '/bounding_box/bottom'] },
+};
+
+export const BOX_SOURCES: BoxSource[] = [
+  { key: 'frigate', text: 'boxes.frigate', help: 'boxes.frigate.help', addresses: [MQTT], format: 'frigate', topics: 'frigate/events' },
+  { key: 'onvif', text: 'boxes.onvif', help: 'boxes.onvif.help', addresses: [MQTT, 'push:'], format: 'onvif', needsSize: true },
+  { key: 'axis', text: 'boxes.axis', help: 'boxes.axis.help', addresses: [MQTT, 'push:'], format: 'json', mapping: AXIS, needsSize: true },
+  { key: 'deepstream', text: 'boxes.deepstream', help: 'boxes.deepstream.help', addresses: [MQTT, 'kafka://broker:9092'], format: 'deepstream' },
+  { key: 'json', text: 'boxes.json', help: 'boxes.json.help', addresses: [MQTT, 'kafka://broker:9092', 'push:'], format: 'json' },
+  { key: 'edge', text: 'boxes.edge', help: 'boxes.edge.help', addresses: [] },
+  { key: 'file', text: 'boxes.file', help: 'boxes.file.help', addresses: [] },
+];
+
+/** What the form of a source holds; texts are empty where nothing is given. */
+export interface BoxSourceForm {
+  address: string;
+  topics: string;
+  senderName: string;
+  username: string;
+  password: string;
+}
+
+export function emptyForm(source: BoxSource): BoxSourceForm {
+  return { address: source.addresses[0] ?? '', topics: source.topics ?? '', senderName: '', username: '', password: '' };
+}
+
+/** Whether an address has topics, and users. */
+export const isBroker = (address: string): boolean => /^(mqtts?|kafkas?):/.test(address);
+
+/** The request for the connection that brings a camera's boxes. */
+export function connectionOf(source: BoxSource, form: BoxSourceForm, camera: { id: string; name: string }, mapping?: JsonMapping): object {
+  const broker = isBroker(form.address);
+  return {
+    id: slugOf(`${source.key} ${camera.id}`),
+    display_name: camera.name,
+    source: {
+      address: form.address.trim(),
+      format: source.format,
+      ...(broker ? { topics: form.topics.split(/[\s,]+/).filter(Boolean) } : {}),
+      ...(broker && form.username.trim() ? { username: form.username.trim() } : {}),
+      ...(mapping ? { mapping } : {}),
+      cameras: { [form.senderName.trim() || '*']: { camera_id: camera.id } },
+      store_samples: true,
+    },
+    secrets: broker && form.password ? { password: form.password } : {},
+  };
+}

@@ -1,0 +1,14 @@
+//! Connections with other systems: their messages, brokers, receivers, webhooks, Cursor on Target, files. Tests whose names
+//! contain `broker` start a real mosquitto or nats-server, or librdkafka's mock cluster; they are ignored by default, and
+//! `.ci/run` installs what they need and runs them.
+
+mod broker;
+mod files;
+mod filters;
+mod kafka;
+mod messages;
+pub(crate) mod peers;
+mod phones;
+mod receivers;
+mod resource;
+mod sinks;

@@ -128,7 +128,7 @@ class Nemesis:
             self._slots.acquire()
             if self._failures:
                 break
-            threads.append(threading.Thread(target=self._inject, args=(fault,), name=fault.kind))
+            threads.append(threading.Thread(target=self._inject, args=(fault,), name=fault.kind, daemon=True))
             threads[-1].start()
         for thread in threads:
             thread.join()

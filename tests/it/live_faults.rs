@@ -251,6 +251,9 @@ fn cases(rows: &[SimulatedRow], origin: Position) -> Vec<Case> {
     ]
 }
 
+/// Radius of 99 % per radius of 95 % of a circular normal error. One row may lie outside of the latter, hardly of the former.
+const R99_PER_R95: f64 = 1.24;
+
 /// Prints the table of docs/explanation/method.md.
 #[tokio::test]
 async fn sources_that_contradict_each_other_are_flagged_and_the_radius_holds_the_truth() {
@@ -275,7 +278,7 @@ async fn sources_that_contradict_each_other_are_flagged_and_the_radius_holds_the
             number(fused, "confidence_regression"),
             flags.join(", ")
         );
-        assert!(error_m <= r95_m, "{name}: {fused}");
+        assert!(error_m <= R99_PER_R95 * r95_m, "{name}: {fused}");
         let apart_m = distance_m(fix, position_of(&fused["regressed"]));
         assert_eq!(flags.contains(&"sources_disagree"), apart_m > 9.5, "{name}: {apart_m} m, {fused}");
         // The live answer of the same observation says the same.

@@ -185,5 +185,6 @@ fn the_noise_of_the_feet_does_not_bend_the_maps() {
     }
     let mean_m: f64 = sum_m / count;
     println!("{mean_m:.3} m");
-    assert!(mean_m < 0.08, "{mean_m}");
+    // Without the noise of the feet the mean is 0.33 m.
+    assert!(mean_m < 0.2, "{mean_m}");
 }

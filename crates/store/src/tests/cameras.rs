@@ -146,11 +146,13 @@ async fn deleting_a_camera_deletes_its_rows_and_frees_its_id() {
 #[tokio::test]
 async fn a_corrupt_row_is_a_fault_that_names_its_place() {
     let fixture = Fixture::new().await;
-    fixture.tamper("UPDATE cameras SET recipe = 'magic' WHERE id = 'square'").await;
+    fixture
+        .tamper(r#"UPDATE cameras SET profile = replace(profile, '"recipe":"', '"recipe":"magic ') WHERE id = 'square'"#)
+        .await;
     let error = fixture.store.camera(&fixture.camera).await.expect_err("corrupt");
     assert_eq!(error.kind(), ErrorKind::Internal);
     let text = error.to_string();
-    for part in ["cameras", "recipe", "id=square", "must be one of"] {
+    for part in ["cameras", "profile", "id=square", "must be one of"] {
         assert!(text.contains(part), "{part} is missing in: {text}");
     }
 }

@@ -28,7 +28,7 @@ test('boxes of any JSON are found in a message, drawn as they come, and filtered
   await setSize(dialog);
   expect(await accessibilityFindings(page)).toEqual([]);
   await dialog.getByRole('button', { name: 'Connect and look at the boxes' }).click();
-  await expect(page.getByRole('heading', { name: 'Gate', exact: true })).toBeVisible();
+  await expect(page.getByRole('heading', { level: 1, name: 'Gate' })).toBeVisible();
   await expect(page.getByText('Running').first()).toBeVisible();
   const { source } = await server.request<{ source: object }>('GET', '/v1/connections/json-gate');
   expect(source).toMatchObject({ format: 'json', mapping: { items: '/objects', target: '/id', class: '/label', score: '/confidence', camera: '/camera', bounding_box: { form: 'corners', unit: 'px' } } });
@@ -82,7 +82,7 @@ test('each source makes a camera, and in German, too', async ({ console: page, s
     await dialog.getByLabel(/^Topics/).fill('site/boxes');
     await setSize(dialog);
     await dialog.getByRole('button', { name: 'Connect and look at the boxes' }).click();
-    await expect(page.getByRole('heading', { name: source, exact: true })).toBeVisible();
+    await expect(page.getByRole('heading', { level: 1, name: source })).toBeVisible();
     const { items } = await server.request<{ items: { source: { format: string; topics: string[]; cameras: object } }[] }>('GET', '/v1/connections');
     const id = source.toLowerCase().replace(' ', '-');
     expect(items.find((it) => JSON.stringify(it.source.cameras).includes(`"${id}"`))?.source).toMatchObject({ format, topics: ['site/boxes'] });

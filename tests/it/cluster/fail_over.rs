@@ -155,7 +155,8 @@ async fn after_an_asynchronous_fail_over_a_node_answers_from_the_history_that_is
     // As another node would: as many keys, as many revoked, and the same latest one as before.
     let revoke = format!("UPDATE api_keys SET revoked_at_us = 1 WHERE id = '{kept_id}'");
     standby.sql(&revoke).expect("revoked");
-    let change = "UPDATE cameras SET revision = revision + 1, image_width_px = 1920, image_height_px = 1080";
+    let change = "UPDATE cameras SET revision = revision + 1, \
+        profile = jsonb_set(profile::jsonb, '{image_size_px}', '[1920, 1080]')::text";
     standby.sql(change).expect("changed");
     let ready = until_status(&node, "/readyz", 200).await;
     assert_eq!(ready.text(), "ready\n", "nobody without a key learns more");

@@ -352,7 +352,7 @@ async fn a_waiting_start_does_not_block_an_index_that_is_built_concurrently() {
     assert!(!waiting.is_finished(), "the schema is locked");
     let mut other = connect(&url(&home)).await;
     // The holder's own transaction has no snapshot either, once its statement has ended.
-    sqlx::raw_sql("CREATE INDEX CONCURRENTLY by_name ON cameras (display_name)")
+    sqlx::raw_sql("CREATE INDEX CONCURRENTLY by_name ON cameras (profile)")
         .execute(&mut other)
         .await
         .expect("is built");

@@ -24,7 +24,7 @@ async function newConnection(page: Page, kind: string): Promise<Locator> {
   return dialog;
 }
 
-const card = (page: Page, name: string): Locator => page.getByRole('article', { name });
+const card = (page: Page, name: string): Locator => page.getByRole('article', { name, exact: true });
 const figure = (of: Locator, name: string): Locator => of.locator('dl div', { has: of.page().getByText(name, { exact: true }) }).locator('dd');
 
 test('a receiver over TCP is connected, watched, tried, paused, resumed and deleted', async ({ console: page, server }) => {

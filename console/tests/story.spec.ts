@@ -50,7 +50,7 @@ test('the real square: drop, map, train, look, try, live', async ({ console: pag
 
   await page.getByLabel('Recipe').selectOption('projective');
   await page.getByRole('button', { name: 'Start training' }).click();
-  await expect(page.getByRole('progressbar')).toBeVisible();
+  await expect(page.getByRole('progressbar', { name: 'Progress of the training run' })).toBeVisible();
   await expect(page.getByText('Version 1 (projective) was fitted')).toBeVisible({ timeout: 1_000_000 });
 
   await page.getByRole('link', { name: 'Look at the scene' }).click();

@@ -2,7 +2,6 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::Write as _;
-use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
@@ -19,6 +18,7 @@ use rcgen::{
 
 use super::output::{print_line, print_note};
 use crate::clock::Clock;
+use crate::exchange::bracketed;
 
 /// The port of the commands that are printed.
 const PORT: u16 = 8443;
@@ -115,10 +115,7 @@ impl SelfSigned {
     }
 
     fn print_next_steps(&self, authority: &Path, certificate: &Path, key: &Path) -> anyhow::Result<()> {
-        let host = match self.hosts[0].parse() {
-            Ok(IpAddr::V6(address)) => format!("[{address}]"),
-            _ => self.hosts[0].clone(),
-        };
+        let host = bracketed(&self.hosts[0]);
         let address = format!("https://{host}:{PORT}/authority.crt");
         print_note("1. serve:");
         print_line(&format_args!(

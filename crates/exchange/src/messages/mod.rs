@@ -17,7 +17,6 @@ mod onvif;
 mod phone;
 mod tagged;
 mod traccar;
-mod xml;
 
 use std::net::SocketAddr;
 

@@ -143,7 +143,7 @@ const table = {
   'camera.id': ['Id', 'Id'],
   'camera.id.help': ['Lower-case letters, digits and hyphens. It cannot be changed later.', 'Kleinbuchstaben, Ziffern und Bindestriche. Später nicht änderbar.'],
   'camera.model': ['Active model', 'Aktives Modell'],
-  'camera.moved.text': ['Since about {began} its positions are off by {shift} on average ({targets} targets agree). The stated radius contains this shift until a new model is active.', 'Seit etwa {began} sind die Positionen im Mittel um {shift} verschoben ({targets} Ziele stimmen überein). Der angegebene Radius enthält diese Verschiebung, bis ein neues Modell aktiv ist.'],
+  'camera.moved.text': ['Since about {onset} its positions are off by {shift} on average ({targets} targets agree). The stated radius contains this shift until a new model is active.', 'Seit etwa {onset} sind die Positionen im Mittel um {shift} verschoben ({targets} Ziele stimmen überein). Der angegebene Radius enthält diese Verschiebung, bis ein neues Modell aktiv ist.'],
   'camera.name': ['Name', 'Name'],
   'camera.name.example': ['North gate', 'Nordtor'],
   'camera.new': ['Add camera', 'Kamera hinzufügen'],

@@ -34,7 +34,7 @@ export interface Receiver {
 }
 export interface CameraMoved {
   model_version: number;
-  began_at: string;
+  onset_at: string;
   raised_at: string;
   shift_east_m: number;
   shift_north_m: number;

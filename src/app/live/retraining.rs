@@ -74,7 +74,7 @@ impl App {
             // The camera still answers by the version that no longer fits.
             None | Some(JobState::Failed | JobState::Succeeded) => {}
         }
-        let request = RunRequest { from: Some(moved.began_at), ..RunRequest::default() };
+        let request = RunRequest { from: Some(moved.onset_at), ..RunRequest::default() };
         match self.start_run(id, request, None).await {
             Ok(run) => {
                 self.store.note_retraining(id, moved.model_version, run.id).await?;

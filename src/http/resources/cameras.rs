@@ -299,9 +299,9 @@ impl Camera {
 pub(super) struct CameraMoved {
     /// Number of the model version that no longer fits.
     model_version: u32,
-    /// When it began, as well as it can be estimated.
+    /// Estimated onset of the change.
     #[schema(value_type = String, format = DateTime)]
-    began_at: Timestamp,
+    onset_at: Timestamp,
     /// When the evidence was enough.
     #[schema(value_type = String, format = DateTime)]
     raised_at: Timestamp,
@@ -317,9 +317,9 @@ pub(super) struct CameraMoved {
 
 impl From<&domain::CameraMoved> for CameraMoved {
     fn from(moved: &domain::CameraMoved) -> Self {
-        let &domain::CameraMoved { model_version, began_at, raised_at, .. } = moved;
+        let &domain::CameraMoved { model_version, onset_at, raised_at, .. } = moved;
         let &domain::CameraMoved { shift_east_m, shift_north_m, statistic, targets, .. } = moved;
-        Self { model_version, began_at, raised_at, shift_east_m, shift_north_m, statistic, targets }
+        Self { model_version, onset_at, raised_at, shift_east_m, shift_north_m, statistic, targets }
     }
 }
 

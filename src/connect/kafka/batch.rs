@@ -66,7 +66,7 @@ impl Batch {
         self.attributes & CONTROL_BIT != 0
     }
 
-    /// The records, decompressed to at most so many bytes.
+    /// The records, decompressed to at most `most_bytes`.
     ///
     /// # Errors
     /// Why they cannot be read.

@@ -44,7 +44,7 @@ impl From<snap::Error> for Undecoded {
     }
 }
 
-/// Decompresses to at most so many bytes; what would become more is not decompressed further.
+/// Decompresses to at most `most_bytes`; fails when the content would become larger.
 ///
 /// # Errors
 /// It is larger, or damaged.

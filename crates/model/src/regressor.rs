@@ -1,9 +1,9 @@
 //! A loaded model: from a box to a position with its error, without allocation.
 
 use super::artifact::{ModelParts, TrackNoiseModel};
-use super::encoder::Encoder;
 use super::encoder::features::{Encoded, reconstruction_error};
-use super::encoder::gaussian_process::{HiddenFoot, RecentBoxes};
+use super::recipes::Encoder;
+use super::recipes::gaussian_process::{HiddenFoot, RecentBoxes};
 use super::site::JointMap;
 use super::uncertainty::error_model::{BoxError, ErrorModel};
 use super::uncertainty::scene::{Limited, Scene};

@@ -1,10 +1,11 @@
 //! The candidates of each recipe.
 
 use crate::domain::{GaussMarkovNoise, ImageSize, Recipe};
-use crate::encoder::projective::Variant;
-use crate::encoder::{FittedEncoder, gaussian_process, hybrid, paper, projective};
+use crate::encoder::FittedEncoder;
 use crate::network::LossWeights;
 use crate::progress::{FitError, Phase};
+use crate::recipes::projective::Variant;
+use crate::recipes::{gaussian_process, hybrid, paper, projective};
 use crate::samples::rows::TrainingRows;
 use crate::samples::unpaired::TargetBox;
 use crate::uncertainty::coverage::Coverage;

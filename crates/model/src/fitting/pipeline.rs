@@ -21,11 +21,11 @@ use crate::domain::{
     CandidateReport, Detection, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError,
     HeldOutSampleError, ImageSize, ModelMetadata, OriginDeg, Recipe, RunProgress, Sample, TrainingReport,
 };
-use crate::encoder::gaussian_process::target_height_m;
+use crate::encoder::geometry::{GeometricCovariance, fit_geometry};
 use crate::encoder::projection_fit::ParameterCovariance;
-use crate::encoder::projective::{GeometricCovariance, fit_geometry};
 use crate::network::LossWeights;
 use crate::progress::{FitError, FitEvent, FitRun, Phase};
+use crate::recipes::gaussian_process::target_height_m;
 use crate::regressor::Regressor;
 use crate::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
 use crate::samples::unpaired::unpaired_boxes;
@@ -280,7 +280,7 @@ impl FinalFit<'_> {
             held_out.e_regression_m2 = mean_variance_m2(&fitted.parts, rows)?;
             held_out.coverage95_of_fixes = coverage_of_fixes(&fitted.parts, rows, residuals)?;
         } else if candidate.estimator != Estimator::Paper {
-            let geometry = GeometricCovariance::of_geometry(geometry);
+            let geometry = GeometricCovariance::new(geometry, None);
             let validation = HeldOut { rows: &rows.rows, residuals, noise: &context.noise };
             let calibration = calibrate(&mut fitted, geometry, &validation, options.image_size)?;
             held_out.e_regression_m2 = calibration.error_m2;

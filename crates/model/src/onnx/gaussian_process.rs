@@ -4,12 +4,12 @@
 use super::boxes::Boxes;
 use super::expression::Expr;
 use super::plane::piecewise_linear;
-use crate::encoder::gaussian_process::box_plausibility::{BoxPlausibility, MAX_LOG_SIDE};
-use crate::encoder::gaussian_process::kernel::SQRT_5;
-use crate::encoder::gaussian_process::predictor::{
+use crate::recipes::gaussian_process::box_plausibility::{BoxPlausibility, MAX_LOG_SIDE};
+use crate::recipes::gaussian_process::kernel::SQRT_5;
+use crate::recipes::gaussian_process::predictor::{
     CoefficientDeviation, PositionMap, Predictor, QUANTILES, SHRINKAGE, UNEXPLAINED_SHARE,
 };
-use crate::encoder::gaussian_process::projective_mean::{
+use crate::recipes::gaussian_process::projective_mean::{
     COEFFICIENTS, MAX_SIDE, MIN_DENOMINATOR, ProjectiveMean,
 };
 

@@ -29,7 +29,7 @@ use self::messages::{
     TensorTypeProto, TypeProto, ValueInfoProto,
 };
 use super::artifact::Artifact;
-use super::encoder::Encoder;
+use super::recipes::Encoder;
 use super::regressor::{Regressor, VARIANCE_RANGE_M2};
 use crate::domain::{ModelMetadata, Result};
 

@@ -3,8 +3,8 @@
 use super::boxes::Boxes;
 use super::expression::Expr;
 use super::network::{decode, encode};
-use crate::encoder::paper::{PaperEncoder, UNITS_PER_DEGREE};
 use crate::geo::Position;
+use crate::recipes::paper::{PaperEncoder, UNITS_PER_DEGREE};
 
 /// The answer of the paper's method.
 #[derive(Debug, Clone, Copy)]

@@ -5,7 +5,7 @@ use super::expression::Expr;
 use super::network::first_hidden;
 use crate::encoder::inverse_camera::{self, InverseCamera};
 use crate::encoder::projection::{self, Projection, TERMS};
-use crate::encoder::projective::ProjectiveEncoder;
+use crate::recipes::projective::ProjectiveEncoder;
 
 /// Position (east and north, m) and reconstructed features, px.
 pub(super) fn encode<'g>(encoder: &ProjectiveEncoder, boxes: Boxes<'g>) -> (Expr<'g>, Expr<'g>) {

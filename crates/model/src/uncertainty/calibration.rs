@@ -10,11 +10,12 @@ use super::variance_components::{
 };
 use crate::artifact::ModelParts;
 use crate::domain::{BoundingBox, GaussMarkovNoise, ImageSize};
+use crate::encoder::FittedEncoder;
 use crate::encoder::features::{Encoded, reconstruction_error};
-use crate::encoder::projective::GeometricCovariance;
-use crate::encoder::{Encoder, FittedEncoder};
+use crate::encoder::geometry::GeometricCovariance;
 use crate::geo::EastNorth;
 use crate::progress::FitError;
+use crate::recipes::Encoder;
 use crate::samples::rows::{HELD_OUT_BLOCKS, TrainingRow};
 use crate::samples::second_differences::{MEAN_SQUARE_PER_VARIANCE, second_differences, trimmed_mean};
 use crate::samples::whitening::effective_sample_size;

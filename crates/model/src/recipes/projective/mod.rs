@@ -8,23 +8,22 @@
 
 use std::sync::Arc;
 
-use super::FittedEncoder;
-use super::auto_encoder::batch_size;
-use super::features::{Encoded, FEATURE_COUNT, FEATURES};
-use super::initial_projection::subset_rng;
-use super::inverse_camera::InverseCamera;
-use super::projection::{COEFFICIENTS, Projection};
-use super::projection_fit::{self, Form, ParameterCovariance, ProjectionFit};
 use crate::artifact::ModelParts;
 use crate::artifact::tensors::Tensors;
 use crate::domain::{BoundingBox, Error, FeatureScale, Recipe, Result};
+use crate::encoder::FittedEncoder;
+use crate::encoder::auto_encoder::batch_size;
+use crate::encoder::features::{Encoded, FEATURE_COUNT, FEATURES};
+use crate::encoder::geometry::{GeometricCovariance, RESIDUAL_UNITS};
+use crate::encoder::initial_projection::subset_rng;
+use crate::encoder::inverse_camera::InverseCamera;
+use crate::encoder::projection::{COEFFICIENTS, Projection};
+use crate::encoder::projection_fit::{self, Form, ProjectionFit};
 use crate::geo::EastNorth;
 use crate::network::{Activation, LossWeights, Net, NetShape, Schedule, TrainingSet};
 use crate::progress::{FitError, Phase};
 use crate::samples::rows::{TrainingRow, TrainingRows};
 
-/// Hidden units of the residual network.
-const HIDDEN: usize = 16;
 /// Default number of epochs.
 pub(crate) const EPOCHS: u32 = 50;
 /// Prior standard deviation of the weight of a residual column, in units of position.
@@ -45,13 +44,7 @@ pub(crate) struct Variant {
 }
 
 fn shape() -> NetShape {
-    NetShape::auto_encoder(FEATURE_COUNT, &[HIDDEN], Activation::Tanh)
-}
-
-/// The geometric map with all features, for the noise of the fixes about it and for the covariance of its
-/// parameters.
-pub(crate) fn fit_geometry(rows: &TrainingRows) -> ProjectionFit {
-    projection_fit::fit(&rows.rows, Form { uses_size: true, extra_sigma: 1.0 }, &[], &mut subset_rng())
+    NetShape::auto_encoder(FEATURE_COUNT, &[RESIDUAL_UNITS], Activation::Tanh)
 }
 
 /// Fits a variant.
@@ -88,10 +81,7 @@ pub(crate) fn fit(
         (position, map.projection.standardised(&row.bounding_box))
     });
     InverseCamera::fit(&boxes.collect::<Vec<_>>()).put(&mut parts.tensors);
-    Ok(FittedEncoder {
-        parts,
-        covariance: Some(GeometricCovariance { parameters: fitted.covariance, network }),
-    })
+    Ok(FittedEncoder { parts, covariance: Some(GeometricCovariance::new(fitted.covariance, network)) })
 }
 
 /// Least and greatest value per axis of a position, in units: the range of the labels without the outermost
@@ -106,30 +96,6 @@ fn bounds_of(projection: &Projection, rows: &[TrainingRow]) -> [[f64; 2]; 2] {
         let range = (high - low).max(1.0);
         [low - range, high + range]
     })
-}
-
-/// The covariance of a fitted geometric map, with the network whose hidden units are its extra columns.
-#[derive(Debug, Clone)]
-pub(crate) struct GeometricCovariance {
-    parameters: ParameterCovariance,
-    network: Option<Net>,
-}
-
-impl GeometricCovariance {
-    /// The covariance of a geometric map without a network.
-    pub(crate) const fn of_geometry(parameters: ParameterCovariance) -> Self {
-        Self { parameters, network: None }
-    }
-
-    /// Error variance per axis at a box due to the noise of the training fixes, m2.
-    pub(crate) fn variance_m2(&self, bounding_box: &BoundingBox) -> f64 {
-        let Some(network) = &self.network else {
-            return self.parameters.variance_m2(bounding_box, &[]);
-        };
-        let inputs = self.parameters.projection().standardised(bounding_box);
-        let hidden: [f32; HIDDEN] = network.first_hidden(&inputs);
-        self.parameters.variance_m2(bounding_box, &hidden.map(f64::from))
-    }
 }
 
 fn scales_of(projection: &Projection) -> Vec<FeatureScale> {
@@ -174,8 +140,8 @@ fn train_residual(
 }
 
 fn hidden_columns(net: &Net, inputs: &[[f32; FEATURE_COUNT]]) -> Vec<Vec<f64>> {
-    let hidden: Vec<[f32; HIDDEN]> = inputs.iter().map(|input| net.first_hidden(input)).collect();
-    (0..HIDDEN).map(|unit| hidden.iter().map(|units| f64::from(units[unit])).collect()).collect()
+    let hidden: Vec<[f32; RESIDUAL_UNITS]> = inputs.iter().map(|input| net.first_hidden(input)).collect();
+    (0..RESIDUAL_UNITS).map(|unit| hidden.iter().map(|units| f64::from(units[unit])).collect()).collect()
 }
 
 /// Weights of the hidden units for east and north, in units of position.
@@ -187,22 +153,26 @@ pub(crate) struct ResidualNetwork {
 
 fn put_residual(tensors: &mut Tensors, parameters: &[f32], weights: &[Vec<f64>; 2]) {
     let layer = shape().layer(0);
-    tensors.put_f32("residual.0.weight", &[HIDDEN, FEATURE_COUNT], parameters[..layer.biases].to_vec());
-    let biases = parameters[layer.biases..layer.biases + HIDDEN].to_vec();
-    tensors.put_f32("residual.0.bias", &[HIDDEN], biases);
+    tensors.put_f32(
+        "residual.0.weight",
+        &[RESIDUAL_UNITS, FEATURE_COUNT],
+        parameters[..layer.biases].to_vec(),
+    );
+    let biases = parameters[layer.biases..layer.biases + RESIDUAL_UNITS].to_vec();
+    tensors.put_f32("residual.0.bias", &[RESIDUAL_UNITS], biases);
     let weights = weights.iter().flatten().copied().collect();
-    tensors.put_f64("residual.1.weight", &[2, HIDDEN], weights);
+    tensors.put_f64("residual.1.weight", &[2, RESIDUAL_UNITS], weights);
 }
 
 fn take_residual(tensors: &mut Tensors) -> Result<Option<ResidualNetwork>> {
     if !tensors.holds("residual.0.weight") {
         return Ok(None);
     }
-    let mut parameters = tensors.take_f32("residual.0.weight", &[HIDDEN, FEATURE_COUNT])?;
-    parameters.extend(tensors.take_f32("residual.0.bias", &[HIDDEN])?);
+    let mut parameters = tensors.take_f32("residual.0.weight", &[RESIDUAL_UNITS, FEATURE_COUNT])?;
+    parameters.extend(tensors.take_f32("residual.0.bias", &[RESIDUAL_UNITS])?);
     parameters.resize(shape().parameter_count(), 0.0);
-    let weights = tensors.take_f64("residual.1.weight", &[2, HIDDEN])?;
-    let (east, north) = weights.split_at(HIDDEN);
+    let weights = tensors.take_f64("residual.1.weight", &[2, RESIDUAL_UNITS])?;
+    let (east, north) = weights.split_at(RESIDUAL_UNITS);
     Ok(Some(ResidualNetwork {
         net: Net::new(shape(), &parameters),
         weights: [east.to_vec(), north.to_vec()],
@@ -223,7 +193,7 @@ impl ProjectiveMap {
     fn position(&self, bounding_box: &BoundingBox) -> EastNorth {
         let extra = self.residual.as_ref().map_or([0.0; 2], |residual| {
             let inputs = self.projection.standardised(bounding_box);
-            let hidden: [f32; HIDDEN] = residual.net.first_hidden(&inputs);
+            let hidden: [f32; RESIDUAL_UNITS] = residual.net.first_hidden(&inputs);
             std::array::from_fn(|axis: usize| {
                 let terms = residual.weights[axis].iter().zip(&hidden);
                 terms.map(|(weight, unit)| weight * f64::from(*unit)).sum()

@@ -1,12 +1,12 @@
 //! The recipe `hybrid`: the paper's auto-encoder and loss on standardised boxes, in metres, without the
 //! fix among the inputs, so that a label cannot predict itself.
 
-use super::FittedEncoder;
-use super::auto_encoder::{self, AutoEncoder, OutputScale, Trained};
-use super::features::{Encoded, FEATURES};
-use super::stored_network::{put_network, take_network};
 use crate::artifact::{ModelParts, Scale};
 use crate::domain::{BoundingBox, FeatureScale, Recipe, Result};
+use crate::encoder::FittedEncoder;
+use crate::encoder::auto_encoder::{self, AutoEncoder, OutputScale, Trained};
+use crate::encoder::features::{Encoded, FEATURES};
+use crate::encoder::stored_network::{put_network, take_network};
 use crate::progress::{FitError, Phase};
 use crate::samples::rows::TrainingRows;
 

@@ -7,10 +7,10 @@
 
 use std::sync::Arc;
 
-use super::FittedEncoder;
-use super::stored_network::{put_network, take_network};
 use crate::artifact::ModelParts;
 use crate::domain::{BoundingBox, FeatureScale, Recipe, Result};
+use crate::encoder::FittedEncoder;
+use crate::encoder::stored_network::{put_network, take_network};
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::network::{Activation, LossSums, LossWeights, Net, NetShape, Schedule, TrainingSet};
 use crate::progress::{FitError, Phase};

@@ -416,11 +416,12 @@ const table = {
   'job.running': ['running', 'läuft'],
   'job.succeeded': ['succeeded', 'erfolgreich'],
 
+  // The recipes, in the order in which they are offered: lib/recipes.ts takes their names from here.
   'recipe.auto': ['The best of the candidates on held-out blocks of time. The default, and the right choice unless you know better.', 'Der beste Kandidat auf zurückgehaltenen Zeitblöcken. Die Voreinstellung und meist die richtige Wahl.'],
-  'recipe.gaussianProcess': ['A projective map with a Gaussian-process residual. Its stated error counts receivers, not rows.', 'Eine projektive Abbildung mit Gauß-Prozess-Rest. Ihr angegebener Fehler zählt Empfänger, nicht Zeilen.'],
+  'recipe.gaussian_process': ['A projective map with a Gaussian-process residual. Its stated error counts receivers, not rows.', 'Eine projektive Abbildung mit Gauß-Prozess-Rest. Ihr angegebener Fehler zählt Empfänger, nicht Zeilen.'],
+  'recipe.projective': ['A homography of the foot point with a small residual network. Fast.', 'Eine Homographie des Fußpunkts mit kleinem Restnetz. Schnell.'],
   'recipe.hybrid': ['An auto-encoder with the hybrid loss in metres, on scaled inputs.', 'Ein Autoencoder mit hybridem Verlust in Metern auf skalierten Eingaben.'],
   'recipe.paper': ['The method of the paper to the letter, for comparison.', 'Das Verfahren der Veröffentlichung, zum Vergleich.'],
-  'recipe.projective': ['A homography of the foot point with a small residual network. Fast.', 'Eine Homographie des Fußpunkts mit kleinem Restnetz. Schnell.'],
 
   'training.advice': ['What would help', 'Was helfen würde'],
   'training.chart': ['Errors by epoch', 'Fehler je Epoche'],

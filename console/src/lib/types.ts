@@ -1,4 +1,5 @@
 // The shapes of the REST interface that the console reads (docs/openapi.json).
+import type { Recipe } from './recipes';
 
 export interface Position {
   longitude_deg: number;
@@ -17,7 +18,6 @@ export interface ImageSize {
   width_px: number;
   height_px: number;
 }
-export type Recipe = 'auto' | 'gaussian_process' | 'projective' | 'hybrid' | 'paper';
 export type JobState = 'queued' | 'running' | 'cancelling' | 'succeeded' | 'failed' | 'cancelled';
 
 /** Whether a job has not ended. */

@@ -11,7 +11,9 @@ use utoipa_axum::routes;
 
 use super::receivers::{Receiver, receivers, shown};
 use crate::app::App;
-use crate::domain::{self, CameraId, Error, GnssBiasSigma, NewCamera, Result, SigmaM, SiteId, TargetClass};
+use crate::domain::{
+    self, CameraId, Error, GnssBiasSigma, NewCamera, Recipe, Result, SigmaM, SiteId, TargetClass,
+};
 use crate::exchange::wire::{Position, parse_document};
 use crate::exchange::write_cursor;
 use crate::http::plumbing::access::CallerApp;
@@ -20,7 +22,7 @@ use crate::http::plumbing::extract::{CameraPath, JsonBody, Params, site_of};
 use crate::http::plumbing::merge_patch::{self, JsonObject};
 use crate::http::plumbing::problem::{ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
-use crate::http::plumbing::wire::{Recipe, created, empty, json};
+use crate::http::plumbing::wire::{created, empty, json};
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(create_camera, list_cameras)).routes(routes!(
@@ -133,7 +135,7 @@ impl CameraDraft {
             gnss_error: self.gnss_error.map_or(Ok(blank.gnss_error), GnssError::to_domain)?,
             location: location.map_err(|error| error.under("location"))?,
             gnss_bias_sigma: self.gnss_bias_sigma_m.map(GnssBiasSigma::new).transpose()?,
-            recipe: self.recipe.map_or(blank.recipe, domain::Recipe::from),
+            recipe: self.recipe.unwrap_or(blank.recipe),
             target_classes: classes(&self.target_classes)?,
             labels: self.labels,
             receivers: receivers(&self.receivers)?,
@@ -273,7 +275,7 @@ impl Camera {
             gnss_error: profile.gnss_error.into(),
             location: profile.location.map(Into::into),
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
-            recipe: profile.recipe.into(),
+            recipe: profile.recipe,
             target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
             labels: profile.labels,
             receivers: shown(&profile.receivers),

@@ -9,7 +9,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use crate::app::EvaluationRequest;
-use crate::domain::{self, Error, EvaluationProgress, Method, Result, SigmaM, Truth};
+use crate::domain::{self, Error, EvaluationProgress, Method, Recipe, Result, SigmaM, Truth};
 use crate::evaluation::ReportWithPositions;
 use crate::exchange::wire::Position;
 use crate::exchange::write_cursor;
@@ -18,7 +18,7 @@ use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::extract::{EvaluationPath, JsonBody, Params, camera_of};
 use crate::http::plumbing::problem::{ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
-use crate::http::plumbing::wire::{JobState, Recipe, created, empty, instant, json};
+use crate::http::plumbing::wire::{JobState, created, empty, instant, json};
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new()
@@ -74,7 +74,7 @@ struct EvaluationDraft {
     #[schema(example = json!([[103.98678, 30.62801], [103.98702, 30.62833]]))]
     truth_line: Option<Vec<Vec<f64>>>,
     /// `gnss`, `imm_ukf`, `dnn`, `dnn.denied`, `homography.denied`, `track`, `track.denied`, and of each
-    /// recipe R of `paper`, `hybrid`, `projective`, `auto`: `R.one_step`, `R.two_step`, `R.denied`. If
+    /// recipe R: `R.one_step`, `R.two_step`, `R.denied`. If
     /// left out: all that the profile's recipe gives, without the networks `dnn`.
     #[schema(example = json!(["gnss", "auto.two_step"]))]
     methods: Option<Vec<String>>,
@@ -218,7 +218,7 @@ impl From<domain::EvaluationJob> for Evaluation {
             truth_point,
             truth_line,
             methods: plan.methods.iter().map(Method::to_string).collect(),
-            recipe: plan.recipe.into(),
+            recipe: plan.recipe,
             seeds: plan.seeds,
             box_shift_px: plan.box_shift_px,
             gnss_sigma_m: plan.gnss_sigma.map(SigmaM::metres),

@@ -16,14 +16,14 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use crate::app::RunRequest;
-use crate::domain::{self, CameraId, EpochReport, Error, Result, RunProgress, TrainingReport};
+use crate::domain::{self, CameraId, EpochReport, Error, Recipe, Result, RunProgress, TrainingReport};
 use crate::exchange::write_cursor;
 use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::extract::{CameraPath, Client, JsonBody, LastEventId, Params, RunPath};
 use crate::http::plumbing::idempotency::Idempotent;
 use crate::http::plumbing::problem::{ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
-use crate::http::plumbing::wire::{JobState, Recipe, created, empty, instant, json};
+use crate::http::plumbing::wire::{JobState, created, empty, instant, json};
 
 /// How often a silent event stream says that it is still there.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -62,7 +62,7 @@ struct RunDraft {
 impl RunDraft {
     fn to_domain(&self) -> Result<RunRequest> {
         Ok(RunRequest {
-            recipe: self.recipe.map(domain::Recipe::from),
+            recipe: self.recipe,
             seed: self.seed,
             epochs: self.epochs,
             from: instant("from", self.from.as_deref())?,
@@ -130,7 +130,7 @@ impl From<domain::TrainingRun<CameraId>> for TrainingRun {
         Self {
             id: run.id.to_string(),
             camera_id: run.subject.as_str().to_owned(),
-            recipe: run.options.recipe.into(),
+            recipe: run.options.recipe,
             seed: run.options.seed,
             epochs: run.options.epochs,
             from: run.options.from,

@@ -13,7 +13,7 @@
 //! | `samples` | training rows in a plane, traverses, held-out targets and blocks of time; boxes without a fix; noise of the fixes and its whitening filter |
 //! | `progress` | observer and progress of a fit |
 //! | `encoder` | what recipes share: the features of a box, the auto-encoder, the projective map and its robust fit |
-//! | `recipes` | a folder per recipe with its fit and its encoder |
+//! | `recipes` | the table of recipes; a folder per recipe with its fit, its encoder and the encoder as expressions of a graph |
 //! | `site` | the cameras of a site trained together: one least-squares problem, the error that they have in common |
 //! | `uncertainty` | coverage, local box model, error model; their calibration by variance components |
 //! | `regressor` | a loaded model: encoder and error model |

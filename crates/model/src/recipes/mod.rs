@@ -1,69 +1,77 @@
-//! The recipes, each in a folder of its own: how it is fitted, and what it makes of a box.
+//! The recipes, each in a folder of its own: the candidates of its fit, its encoder, and the encoder as an ONNX graph.
+//!
+//! A recipe is registered by its name in [`Recipe`] and its line in [`definition`].
 
+mod candidate;
+mod fit_context;
 pub(crate) mod gaussian_process;
-pub(crate) mod hybrid;
-pub(crate) mod paper;
-pub(crate) mod projective;
+mod hybrid;
+mod paper;
+mod projective;
 
-use self::gaussian_process::GaussianProcessEncoder;
-use self::hybrid::HybridEncoder;
-use self::paper::PaperEncoder;
-use self::projective::ProjectiveEncoder;
+use std::sync::Arc;
+
 use crate::artifact::ModelParts;
-use crate::domain::{BoundingBox, Error, Recipe, Result};
-use crate::encoder::features::{Encoded, features_of};
-use crate::geo::{LocalPlane, PlaneCovariance};
+use crate::domain::{Error, Recipe, Result};
+use crate::encoder::Encoder;
 
-/// The encoder of a loaded model, by recipe.
-#[derive(Debug, Clone)]
-pub(crate) enum Encoder {
-    Paper(Box<PaperEncoder>),
-    Hybrid(Box<HybridEncoder>),
-    Projective(Box<ProjectiveEncoder>),
-    GaussianProcess(Box<GaussianProcessEncoder>),
+pub(crate) use candidate::{Candidate, Estimator};
+pub(crate) use fit_context::FitContext;
+
+/// How the models of a recipe are fitted and loaded.
+pub(crate) struct Definition {
+    /// The ways to fit it, the one to keep unless another is clearly better first.
+    candidates: &'static [Candidate],
+    /// Takes the encoder's tensors out of the parts of a model.
+    load: fn(&mut ModelParts) -> Result<Arc<dyn Encoder>>,
+    error_source: ErrorSource,
 }
 
-impl Encoder {
-    /// Takes the encoder's tensors out of the parts of a model.
-    ///
-    /// # Errors
-    /// Names the tensor or metadata field that is missing or cannot be used.
-    pub(crate) fn build(parts: &mut ModelParts) -> Result<Self> {
-        Ok(match parts.recipe {
-            Recipe::Paper => Self::Paper(Box::new(PaperEncoder::build(parts)?)),
-            Recipe::Hybrid => Self::Hybrid(Box::new(HybridEncoder::build(parts)?)),
-            Recipe::Projective => Self::Projective(Box::new(ProjectiveEncoder::build(parts)?)),
-            Recipe::GaussianProcess => Self::GaussianProcess(Box::new(GaussianProcessEncoder::build(parts)?)),
-            Recipe::Auto => {
-                let message =
-                    "must be the recipe that auto has chosen: paper, hybrid, projective or gaussian_process";
-                return Err(Error::invalid("metadata.recipe", message));
-            }
-        })
-    }
+/// Where the stated error of a recipe's answers comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum ErrorSource {
+    /// A formula of the recipe alone, which nothing calibrates.
+    Formula,
+    /// The recipe's fit, calibrated on targets that it leaves out.
+    LeftOutTargets,
+    /// The error model, calibrated by the residuals of held-out rows.
+    HeldOutRows,
+}
 
-    /// The error that a map and others have in common (m2), as this encoder states it: widened as the map's own, and
-    /// with the bias that all receivers have in common.
-    pub(crate) fn widened(&self, common_m2: PlaneCovariance) -> PlaneCovariance {
-        match self {
-            Self::GaussianProcess(map) => {
-                let bias = PlaneCovariance::isotropic(map.predictor.shared_bias_m2);
-                common_m2.scaled(map.predictor.widening).plus(bias)
-            }
-            Self::Paper(_) | Self::Hybrid(_) | Self::Projective(_) => common_m2,
-        }
-    }
+/// The recipes that `auto` chooses among, the one to keep unless another is clearly better first.
+const AUTO: [Recipe; 3] = [Recipe::GaussianProcess, Recipe::Projective, Recipe::Hybrid];
 
-    /// Position and reconstruction of a box alone.
-    pub(crate) fn encode(&self, plane: &LocalPlane, bounding_box: &BoundingBox) -> Encoded {
-        match self {
-            Self::Paper(paper) => Encoded {
-                position: paper.estimate(plane, bounding_box, None).position,
-                reconstruction_px: features_of(bounding_box),
-            },
-            Self::Hybrid(hybrid) => hybrid.encode(bounding_box),
-            Self::Projective(projective) => projective.encode(bounding_box),
-            Self::GaussianProcess(map) => map.estimate(bounding_box, None).encoded,
-        }
+/// The table of recipes. `auto` has no model of its own.
+fn definition(recipe: Recipe) -> Option<&'static Definition> {
+    match recipe {
+        Recipe::Paper => Some(&paper::DEFINITION),
+        Recipe::Hybrid => Some(&hybrid::DEFINITION),
+        Recipe::Projective => Some(&projective::DEFINITION),
+        Recipe::GaussianProcess => Some(&gaussian_process::DEFINITION),
+        Recipe::Auto => None,
     }
+}
+
+/// The candidates of a recipe, the one to keep unless another is clearly better first.
+pub(crate) fn candidates(recipe: Recipe) -> impl Iterator<Item = &'static Candidate> {
+    let recipes = if recipe == Recipe::Auto { AUTO.to_vec() } else { vec![recipe] };
+    recipes.into_iter().filter_map(definition).flat_map(|definition| definition.candidates)
+}
+
+/// Takes the encoder's tensors out of the parts of a model.
+///
+/// # Errors
+/// Names the tensor or metadata field that is missing or cannot be used.
+pub(crate) fn load(parts: &mut ModelParts) -> Result<Arc<dyn Encoder>> {
+    let Some(definition) = definition(parts.recipe) else {
+        let names = AUTO.map(Recipe::as_str).join(", ");
+        let message = format!("must be the recipe that auto has chosen: one of {names}");
+        return Err(Error::invalid("metadata.recipe", message));
+    };
+    (definition.load)(parts)
+}
+
+/// Where the stated error of a recipe's answers comes from.
+pub(crate) fn error_source(recipe: Recipe) -> ErrorSource {
+    definition(recipe).map_or(ErrorSource::HeldOutRows, |definition| definition.error_source)
 }

@@ -6,7 +6,7 @@
 //! `candidate`, `leave_out`, `sessions`, `fit`, `companion`; `ground_camera` for association without a model; of an answer: `predictor`, `box_plausibility`, `hidden_foot`;
 //! `recipe` and `stored` connect both to the rest of the module; `foot_map` takes the map of another fit, and `upright_geometry` gives it a prior. Random starts have a seed of their own.
 
-pub(crate) mod box_plausibility;
+mod box_plausibility;
 mod candidate;
 mod companion;
 mod edge_noise;
@@ -17,12 +17,13 @@ mod ground_camera;
 mod groups;
 mod hidden_foot;
 mod hyperparameters;
-pub(crate) mod kernel;
+mod kernel;
 mod leave_out;
 mod map_rows;
 mod noise;
+mod onnx;
 mod posterior;
-pub(crate) mod predictor;
+mod predictor;
 pub(crate) mod projective_mean;
 mod recipe;
 mod sessions;
@@ -38,7 +39,8 @@ pub use ground_camera::{GroundCamera, GroundPoint};
 pub use hidden_foot::HiddenFoot;
 pub(crate) use leave_out::{SequenceMean, widening};
 pub(crate) use noise::{Epoch, ReceiverNoise, ReceiverWhitener};
-pub(crate) use recipe::{GaussianProcessEncoder, Settings, fit, receiver_correlation, target_height_m};
+pub(super) use recipe::DEFINITION;
+pub(crate) use recipe::{receiver_correlation, target_height_m};
 pub(crate) use sessions::weighted_mean;
 pub(crate) use upright_geometry::{FootPrior, UprightGeometry, UprightStarts};
 

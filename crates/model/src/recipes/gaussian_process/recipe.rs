@@ -1,46 +1,63 @@
 //! The recipe `gaussian_process`: from training samples to the parts of a model.
 
+use std::sync::Arc;
+
 use super::box_plausibility::RecentBoxes;
 use super::companion;
 use super::fit::{FitReport, FitSettings, fit as fit_map};
+use super::hidden_foot::HiddenFoot;
 use super::map_rows::MapRows;
 use super::noise::Epoch;
-use super::predictor::Predictor;
+use super::onnx;
+use super::predictor::{MapPrediction, Predictor};
 use super::upright_camera::UprightCamera;
 use crate::artifact::{LEAST_GNSS_WHITE_SHARE, ModelParts};
 use crate::domain::{
-    BoundingBox, Error, ErrorKind, ImageSize, NoiseCorrelation, Recipe, SessionBias, TargetClass,
+    BoundingBox, Error, ErrorKind, NoiseCorrelation, Recipe, Result, SessionBias, TargetClass,
 };
-use crate::encoder::FittedEncoder;
 use crate::encoder::auto_encoder::AutoEncoder;
-use crate::encoder::features::{Encoded, features_of};
-use crate::geo::{EastNorth, PlaneCovariance};
+use crate::encoder::features::{Encoded, features_of, reconstruction_error};
+use crate::encoder::{Encoder, ErrorContext, Estimate, FittedEncoder};
+use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
+use crate::onnx::answer::{Answer, GraphContext};
 use crate::progress::{FitError, Phase};
+use crate::recipes::{Candidate, Definition, ErrorSource, Estimator, FitContext};
 use crate::samples::rows::TrainingRows;
-use crate::samples::unpaired::TargetBox;
 
 /// Median height of a target in m, and the standard deviation of its logarithm, by class; the last is for
 /// all other classes, whose heights only have to agree with each other.
 const TARGET_HEIGHTS: [(&[&str], (f64, f64)); 3] =
     [(&["person", "pedestrian"], (1.70, 0.05)), (&["car"], (1.50, 0.10)), (&[], (1.70, 1.0))];
 
-/// Input of the recipe besides the samples.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Settings<'a> {
-    /// Error variance per axis of the receiver, m2.
-    pub(crate) e_gnss_m2: f64,
-    /// True if that was estimated, and may be replaced by the estimate of this recipe.
-    pub(crate) e_gnss_is_estimated: bool,
-    /// Standard deviation per axis of the bias that all fixes have in common, m, if known.
-    pub(crate) gnss_bias_sigma_m: Option<f64>,
-    /// White share of the variance of the fixes about a geometric map.
-    pub(crate) white_share: f64,
-    pub(crate) image_size: Option<ImageSize>,
-    /// Boxes without a fix, in the order of target and time.
-    pub(crate) unpaired: &'a [TargetBox],
-    /// Median height of the targets, m, and the standard deviation of its logarithm.
-    pub(crate) target_height_m: (f64, f64),
-    pub(crate) seed: u64,
+/// The recipe.
+pub(crate) static DEFINITION: Definition = Definition {
+    candidates: &[Candidate { name: "gaussian_process", estimator: &GaussianProcess, is_smoothed: false }],
+    load: |parts| Ok(Arc::new(GaussianProcessEncoder::build(parts)?)),
+    error_source: ErrorSource::LeftOutTargets,
+};
+
+/// The fit of the recipe; the final one also trains the auto-encoder.
+#[derive(Debug)]
+struct GaussianProcess;
+
+impl Estimator for GaussianProcess {
+    fn epochs(&self) -> u32 {
+        companion::EPOCHS
+    }
+
+    fn networks(&self, is_final: bool) -> u32 {
+        u32::from(is_final)
+    }
+
+    fn fit(
+        &self,
+        rows: &TrainingRows,
+        context: &FitContext<'_>,
+        epochs: u32,
+        phase: &mut Phase<'_, '_>,
+    ) -> Result<FittedEncoder, FitError> {
+        fit(rows, context, epochs, phase)
+    }
 }
 
 /// Height of the targets that most samples show.
@@ -65,27 +82,27 @@ pub(crate) fn target_height_m<'a>(classes: impl Iterator<Item = Option<&'a Targe
 ///
 /// # Errors
 /// [`FitError::Unusable`] where the rows determine no map.
-pub(crate) fn fit(
+fn fit(
     rows: &TrainingRows,
-    settings: &Settings<'_>,
+    context: &FitContext<'_>,
     epochs: u32,
     phase: &mut Phase<'_, '_>,
 ) -> Result<FittedEncoder, FitError> {
     let map_rows = map_rows(rows);
-    let unpaired = settings.unpaired.iter().map(|own| (own.target, features_of(&own.bounding_box)));
+    let unpaired = context.unpaired.iter().map(|own| (own.target, features_of(&own.bounding_box)));
     let paired = rows.rows.iter().zip(&map_rows.boxes).map(|(row, sides)| (row.target, *sides));
     let mut boxes: Vec<(u32, [f64; 4])> = paired.chain(unpaired).collect();
     boxes.sort_by_key(|(target, _)| *target);
-    let upright = settings.image_size.and_then(|size| {
+    let upright = context.image_size.and_then(|size| {
         let size_px = (f64::from(size.width_px()), f64::from(size.height_px()));
-        UprightCamera::new(&boxes, size_px, settings.target_height_m)
+        UprightCamera::new(&boxes, size_px, context.target_height_m)
     });
-    let bias_sigma_m = settings.gnss_bias_sigma_m;
+    let bias_sigma_m = context.gnss_bias_sigma_m;
     let map_settings = FitSettings {
         bias_sigma_m,
-        white_share: settings.white_share,
-        receiver_m2: (!settings.e_gnss_is_estimated).then_some(settings.e_gnss_m2),
-        seed: settings.seed,
+        white_share: context.noise.correlation.white_share,
+        receiver_m2: (!context.e_gnss_is_estimated).then_some(context.e_gnss_m2),
+        seed: context.seed,
         upright,
     };
     let fitted = fit_map(&map_rows, &map_settings);
@@ -100,11 +117,11 @@ pub(crate) fn fit(
         note(&report, phase)?;
     }
     let receiver_m2 = report.receiver.variance_m2();
-    let e_gnss_m2 = if settings.e_gnss_is_estimated { receiver_m2 } else { settings.e_gnss_m2 };
+    let e_gnss_m2 = if context.e_gnss_is_estimated { receiver_m2 } else { context.e_gnss_m2 };
     let mut parts = ModelParts::new(Recipe::GaussianProcess, rows.plane, predictor.features(), e_gnss_m2);
     predictor.put(&mut parts);
     put_report(&report, &mut parts);
-    parts.set("boxes_without_fix", settings.unpaired.len() as f64);
+    parts.set("boxes_without_fix", context.unpaired.len() as f64);
     parts.set("unrest_share", white_share(&predictor, &map_rows));
     if phase.is_final {
         companion::fit(rows, epochs, &mut parts, phase)?;
@@ -207,39 +224,27 @@ fn note(report: &FitReport, phase: &mut Phase<'_, '_>) -> Result<(), FitError> {
 }
 
 /// The encoder of a loaded model.
-#[derive(Debug, Clone)]
-pub(crate) struct GaussianProcessEncoder {
-    pub(crate) predictor: Predictor,
+#[derive(Debug)]
+pub(super) struct GaussianProcessEncoder {
+    pub(super) predictor: Predictor,
     /// Fits of parts of the rows have none.
-    pub(crate) auto_encoder: Option<AutoEncoder>,
-}
-
-/// Position, error and reconstruction of a box.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct BoxEstimate {
-    pub(crate) encoded: Encoded,
-    /// Covariance of the position's error, m2.
-    pub(crate) covariance: PlaneCovariance,
-    /// The part of it that is new with each box, m2.
-    pub(crate) box_noise: PlaneCovariance,
-    /// Radius of 95 % in standard deviations.
-    pub(crate) r95_scale: f64,
+    pub(super) auto_encoder: Option<AutoEncoder>,
 }
 
 impl GaussianProcessEncoder {
     /// # Errors
     /// Names the tensor or scalar that is missing or cannot be used.
-    pub(crate) fn build(parts: &mut ModelParts) -> crate::domain::Result<Self> {
+    fn build(parts: &mut ModelParts) -> Result<Self> {
         Ok(Self { predictor: Predictor::take(parts)?, auto_encoder: companion::take(parts)? })
     }
 
-    /// Position and error of a box. `recent` holds the earlier boxes of its target, and takes this one in.
+    /// Position and reconstruction of a box, and its prediction.
     #[inline]
-    pub(crate) fn estimate(
+    fn predict(
         &self,
         bounding_box: &BoundingBox,
         recent: Option<&mut RecentBoxes>,
-    ) -> BoxEstimate {
+    ) -> (Encoded, MapPrediction) {
         let sides = features_of(bounding_box);
         let prediction = self.predictor.predict(&sides, recent);
         let [east_m, north_m] = prediction.position_m;
@@ -247,18 +252,54 @@ impl GaussianProcessEncoder {
             Some(auto_encoder) => auto_encoder.encode(bounding_box).reconstruction_px,
             None => self.predictor.reconstruct(&sides, &prediction.deviation),
         };
-        BoxEstimate {
-            encoded: Encoded { position: EastNorth { east_m, north_m }, reconstruction_px },
+        (Encoded { position: EastNorth { east_m, north_m }, reconstruction_px }, prediction)
+    }
+}
+
+impl Encoder for GaussianProcessEncoder {
+    fn encode(&self, _plane: &LocalPlane, bounding_box: &BoundingBox) -> Encoded {
+        self.predict(bounding_box, None).0
+    }
+
+    /// Its error comes with every answer, not from the error model.
+    fn estimate(
+        &self,
+        model: &ErrorContext<'_>,
+        bounding_box: &BoundingBox,
+        _fix: Option<EastNorth>,
+        recent: Option<&mut RecentBoxes>,
+    ) -> Estimate {
+        let (encoded, prediction) = self.predict(bounding_box, recent);
+        Estimate {
+            position: encoded.position,
+            reconstruction_error: reconstruction_error(bounding_box, &encoded),
             covariance: plane_covariance(prediction.covariance_m2),
             box_noise: plane_covariance(prediction.box_noise_m2),
+            extrapolation_ratio: model.error_model.extrapolation_ratio(bounding_box),
             r95_scale: prediction.r95_scale,
         }
     }
 
-    /// Covariance of the error that the map makes in the distance between two boxes, m2.
-    pub(crate) fn displacement_covariance(&self, boxes: [&BoundingBox; 2]) -> PlaneCovariance {
+    fn express<'g>(&self, context: &GraphContext<'_, 'g>) -> Answer<'g> {
+        onnx::express(self, context)
+    }
+
+    fn widened(&self, common_m2: PlaneCovariance) -> PlaneCovariance {
+        let bias = PlaneCovariance::isotropic(self.predictor.shared_bias_m2);
+        common_m2.scaled(self.predictor.widening).plus(bias)
+    }
+
+    fn displacement_covariance(&self, boxes: [&BoundingBox; 2]) -> Option<PlaneCovariance> {
         let [from, to] = boxes.map(features_of);
-        plane_covariance(self.predictor.displacement_m2([&from, &to]))
+        Some(plane_covariance(self.predictor.displacement_m2([&from, &to])))
+    }
+
+    fn hidden_foot(
+        &self,
+        bounding_box: &BoundingBox,
+        recent: Option<&mut RecentBoxes>,
+    ) -> Option<HiddenFoot> {
+        HiddenFoot::of(bounding_box, &self.predictor.plausibility, recent)
     }
 }
 

@@ -5,58 +5,86 @@
 //! (4) from the last epoch. A network that has the fix among its inputs learns to reproduce it; none of
 //! the remedies in `docs/explanation/method.md` applies here.
 
+mod onnx;
+
 use std::sync::Arc;
 
+use super::{Candidate, Definition, ErrorSource, Estimator, FitContext};
 use crate::artifact::ModelParts;
 use crate::domain::{BoundingBox, FeatureScale, Recipe, Result};
-use crate::encoder::FittedEncoder;
+use crate::encoder::features::{Encoded, features_of};
 use crate::encoder::stored_network::{put_network, take_network};
+use crate::encoder::{Encoder, ErrorContext, Estimate, FittedEncoder};
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::network::{Activation, LossSums, LossWeights, Net, NetShape, Schedule, TrainingSet};
+use crate::onnx::answer::{Answer, GraphContext};
 use crate::progress::{FitError, Phase};
+use crate::recipes::gaussian_process::RecentBoxes;
 use crate::samples::rows::TrainingRows;
 use crate::statistics::R95_PER_SIGMA;
+use crate::uncertainty::error_model::BoxError;
+
+/// The recipe.
+pub(super) static DEFINITION: Definition = Definition {
+    candidates: &[Candidate { name: "paper", estimator: &Paper, is_smoothed: false }],
+    load: |parts| Ok(Arc::new(PaperEncoder::build(parts)?)),
+    error_source: ErrorSource::Formula,
+};
 
 /// Units per degree.
-pub(crate) const UNITS_PER_DEGREE: f64 = 1e4;
+const UNITS_PER_DEGREE: f64 = 1e4;
 /// Metres per degree at the equator, for positions outside the range of coordinates.
 const METRES_PER_DEGREE: f64 = 111_320.0;
 /// Hidden units; not specified in the paper.
 const HIDDEN: usize = 32;
-/// Default number of epochs; not specified in the paper.
-pub(crate) const EPOCHS: u32 = 100;
 const BATCH: usize = 128;
 const WEIGHTS: LossWeights = LossWeights { reconstruction: 1.0, regression: 2000.0 };
 const INPUTS: [&str; 6] = ["left_px", "top_px", "width_px", "height_px", "longitude_deg", "latitude_deg"];
 /// Number of the inputs that come from the box.
 const BOX_INPUTS: usize = 4;
 
-/// Fits both networks.
-pub(crate) fn fit(
-    rows: &TrainingRows,
-    e_gnss_m2: f64,
-    epochs: u32,
-    phase: &mut Phase<'_, '_>,
-) -> Result<FittedEncoder, FitError> {
-    let offset = lowest_corner(rows);
-    let units: [Vec<f32>; 2] = std::array::from_fn(|axis| {
-        rows.rows.iter().map(|row| standardised(offset, row.position)[axis]).collect()
-    });
-    let mut parts = ModelParts::new(Recipe::Paper, LocalPlane::new(offset), scales_about(offset), e_gnss_m2);
-    parts.set("r95_scale", R95_PER_SIGMA);
-    let schedule = Schedule { epochs, batch: BATCH, learning_rate: 0.005, last_rate_share: 1.0 };
-    for (prefix, inputs) in [("joint.", INPUTS.len()), ("denied.", BOX_INPUTS)] {
-        let shape = shape(inputs);
-        let set = Arc::new(training_set(rows, &units, inputs));
-        let (parameters, sums) = phase.train(prefix, &shape, set, WEIGHTS, schedule)?;
-        put_network(&mut parts.tensors, prefix, &shape, &parameters);
-        if inputs == BOX_INPUTS {
-            parts.set("denied_error_scale", error_scale(&sums));
-        } else {
-            parts.error_scale = error_scale(&sums);
-        }
+/// The fit of both networks.
+#[derive(Debug)]
+struct Paper;
+
+impl Estimator for Paper {
+    /// Not specified in the paper.
+    fn epochs(&self) -> u32 {
+        100
     }
-    Ok(FittedEncoder { parts, covariance: None })
+
+    fn networks(&self, _is_final: bool) -> u32 {
+        2
+    }
+
+    fn fit(
+        &self,
+        rows: &TrainingRows,
+        context: &FitContext<'_>,
+        epochs: u32,
+        phase: &mut Phase<'_, '_>,
+    ) -> Result<FittedEncoder, FitError> {
+        let offset = lowest_corner(rows);
+        let units: [Vec<f32>; 2] = std::array::from_fn(|axis| {
+            rows.rows.iter().map(|row| standardised(offset, row.position)[axis]).collect()
+        });
+        let mut parts =
+            ModelParts::new(Recipe::Paper, LocalPlane::new(offset), scales_about(offset), context.e_gnss_m2);
+        parts.set("r95_scale", R95_PER_SIGMA);
+        let schedule = Schedule { epochs, batch: BATCH, learning_rate: 0.005, last_rate_share: 1.0 };
+        for (prefix, inputs) in [("joint.", INPUTS.len()), ("denied.", BOX_INPUTS)] {
+            let shape = shape(inputs);
+            let set = Arc::new(training_set(rows, &units, inputs));
+            let (parameters, sums) = phase.train(prefix, &shape, set, WEIGHTS, schedule)?;
+            put_network(&mut parts.tensors, prefix, &shape, &parameters);
+            if inputs == BOX_INPUTS {
+                parts.set("denied_error_scale", error_scale(&sums));
+            } else {
+                parts.error_scale = error_scale(&sums);
+            }
+        }
+        Ok(FittedEncoder { parts, covariance: None })
+    }
 }
 
 fn scales_about(offset: Position) -> Vec<FeatureScale> {
@@ -119,29 +147,19 @@ fn standardised(offset: Position, position: Position) -> [f32; 2] {
     ]
 }
 
-/// The answer of the paper's method.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct PaperEstimate {
-    pub(crate) position: EastNorth,
-    /// eX of (2), mixed units.
-    pub(crate) reconstruction_error: f64,
-    /// Es eX, the mean variance per axis, m2.
-    pub(crate) variance_m2: f64,
-}
-
 /// Both networks for inference.
-#[derive(Debug, Clone)]
-pub(crate) struct PaperEncoder {
+#[derive(Debug)]
+struct PaperEncoder {
     joint: Net,
-    pub(crate) denied: Net,
+    denied: Net,
     /// Es of (4) of the joint and of the denied network, units2 per unit of eX.
-    pub(crate) error_scales: [f64; 2],
+    error_scales: [f64; 2],
     /// m2 per unit2, mean of both axes.
-    pub(crate) unit_m2: f64,
+    unit_m2: f64,
 }
 
 impl PaperEncoder {
-    pub(super) fn build(parts: &mut ModelParts) -> Result<Self> {
+    fn build(parts: &mut ModelParts) -> Result<Self> {
         parts.scales(INPUTS)?;
         let plane = &parts.plane;
         let corner = Position::new(
@@ -158,12 +176,12 @@ impl PaperEncoder {
     }
 
     /// Position with its error by (4); the joint network if there is a fix, else the denied one.
-    pub(crate) fn estimate(
+    fn answer(
         &self,
         plane: &LocalPlane,
         bounding_box: &BoundingBox,
         fix: Option<EastNorth>,
-    ) -> PaperEstimate {
+    ) -> (EastNorth, BoxError) {
         let [left, top, width, height] = bounding_box.sides_px().map(|side| side as f32);
         let (east, north, count, network, error_scale) = match fix {
             Some(fix) => {
@@ -177,11 +195,36 @@ impl PaperEncoder {
         let reconstruction = network.decode(bottleneck);
         let squares = inputs.iter().zip(&reconstruction).map(|(one, other)| f64::from(one - other).powi(2));
         let reconstruction_error = squares.sum::<f64>() / count as f64;
-        PaperEstimate {
-            position: in_plane(plane, bottleneck),
-            reconstruction_error,
-            variance_m2: error_scale * reconstruction_error * self.unit_m2,
+        let variance_m2 = error_scale * reconstruction_error * self.unit_m2;
+        (in_plane(plane, bottleneck), BoxError { reconstruction_error, variance_m2 })
+    }
+}
+
+impl Encoder for PaperEncoder {
+    fn encode(&self, plane: &LocalPlane, bounding_box: &BoundingBox) -> Encoded {
+        Encoded {
+            position: self.answer(plane, bounding_box, None).0,
+            reconstruction_px: features_of(bounding_box),
         }
+    }
+
+    fn estimate(
+        &self,
+        model: &ErrorContext<'_>,
+        bounding_box: &BoundingBox,
+        fix: Option<EastNorth>,
+        _recent: Option<&mut RecentBoxes>,
+    ) -> Estimate {
+        let (position, error) = self.answer(model.plane, bounding_box, fix);
+        model.isotropic(position, error, model.error_model.extrapolation_ratio(bounding_box))
+    }
+
+    fn express<'g>(&self, context: &GraphContext<'_, 'g>) -> Answer<'g> {
+        onnx::express(self, context)
+    }
+
+    fn uses_fix(&self) -> bool {
+        true
     }
 }
 

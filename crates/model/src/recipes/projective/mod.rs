@@ -6,12 +6,14 @@
 //! added as columns. The decoder maps the position back to a box by a second ratio of linear functions.
 //! The fix is not among the inputs.
 
+mod onnx;
+
 use std::sync::Arc;
 
+use super::{Candidate, Definition, ErrorSource, Estimator, FitContext};
 use crate::artifact::ModelParts;
 use crate::artifact::tensors::Tensors;
 use crate::domain::{BoundingBox, Error, FeatureScale, Recipe, Result};
-use crate::encoder::FittedEncoder;
 use crate::encoder::auto_encoder::batch_size;
 use crate::encoder::features::{Encoded, FEATURE_COUNT, FEATURES};
 use crate::encoder::geometry::{GeometricCovariance, RESIDUAL_UNITS};
@@ -19,13 +21,13 @@ use crate::encoder::initial_projection::subset_rng;
 use crate::encoder::inverse_camera::InverseCamera;
 use crate::encoder::projection::{COEFFICIENTS, Projection};
 use crate::encoder::projection_fit::{self, Form, ProjectionFit};
-use crate::geo::EastNorth;
+use crate::encoder::{Encoder, FittedEncoder};
+use crate::geo::{EastNorth, LocalPlane};
 use crate::network::{Activation, LossWeights, Net, NetShape, Schedule, TrainingSet};
+use crate::onnx::answer::{Answer, GraphContext};
 use crate::progress::{FitError, Phase};
 use crate::samples::rows::{TrainingRow, TrainingRows};
 
-/// Default number of epochs.
-pub(crate) const EPOCHS: u32 = 50;
 /// Prior standard deviation of the weight of a residual column, in units of position.
 const RESIDUAL_SIGMA: f64 = 0.1;
 /// Bound of the residual network's targets, in standard deviations of the residuals.
@@ -34,13 +36,49 @@ const WEIGHTS: LossWeights = LossWeights { reconstruction: 0.2, regression: 1.0 
 /// Share of the labels on either side that the bounds of the positions ignore.
 const IGNORED_SHARE: usize = 100;
 
+/// The recipe.
+pub(super) static DEFINITION: Definition = Definition {
+    candidates: &[
+        Candidate { name: "projective/foot", estimator: &FOOT, is_smoothed: false },
+        Candidate { name: "projective/sides", estimator: &SIDES, is_smoothed: false },
+        Candidate { name: "projective/sides+smoothed", estimator: &SIDES, is_smoothed: true },
+        Candidate { name: "projective/residual", estimator: &RESIDUAL, is_smoothed: false },
+    ],
+    load: |parts| Ok(Arc::new(ProjectiveEncoder::build(parts)?)),
+    error_source: ErrorSource::HeldOutRows,
+};
+
 /// The parts of the recipe that are used.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Variant {
+#[derive(Debug, Clone, Copy)]
+struct Variant {
     /// True if the position depends on width and height besides the foot point.
-    pub(crate) uses_size: bool,
+    uses_size: bool,
     /// True if the hidden units of a network are added to the geometric map.
-    pub(crate) residual: bool,
+    residual: bool,
+}
+
+const FOOT: Variant = Variant { uses_size: false, residual: false };
+const SIDES: Variant = Variant { uses_size: true, residual: false };
+const RESIDUAL: Variant = Variant { uses_size: true, residual: true };
+
+impl Estimator for Variant {
+    fn epochs(&self) -> u32 {
+        50
+    }
+
+    fn networks(&self, _is_final: bool) -> u32 {
+        u32::from(self.residual)
+    }
+
+    fn fit(
+        &self,
+        rows: &TrainingRows,
+        context: &FitContext<'_>,
+        epochs: u32,
+        phase: &mut Phase<'_, '_>,
+    ) -> Result<FittedEncoder, FitError> {
+        fit(rows, *self, context.e_gnss_m2, epochs, phase)
+    }
 }
 
 fn shape() -> NetShape {
@@ -48,7 +86,7 @@ fn shape() -> NetShape {
 }
 
 /// Fits a variant.
-pub(crate) fn fit(
+fn fit(
     rows: &TrainingRows,
     variant: Variant,
     e_gnss_m2: f64,
@@ -146,9 +184,9 @@ fn hidden_columns(net: &Net, inputs: &[[f32; FEATURE_COUNT]]) -> Vec<Vec<f64>> {
 
 /// Weights of the hidden units for east and north, in units of position.
 #[derive(Debug, Clone)]
-pub(crate) struct ResidualNetwork {
-    pub(crate) net: Net,
-    pub(crate) weights: [Vec<f64>; 2],
+struct ResidualNetwork {
+    net: Net,
+    weights: [Vec<f64>; 2],
 }
 
 fn put_residual(tensors: &mut Tensors, parameters: &[f32], weights: &[Vec<f64>; 2]) {
@@ -181,11 +219,11 @@ fn take_residual(tensors: &mut Tensors) -> Result<Option<ResidualNetwork>> {
 
 /// The map from a box to a position.
 #[derive(Debug, Clone)]
-pub(crate) struct ProjectiveMap {
-    pub(crate) projection: Projection,
+struct ProjectiveMap {
+    projection: Projection,
     /// Least and greatest position per axis, in units.
-    pub(crate) bounds: [[f64; 2]; 2],
-    pub(crate) residual: Option<ResidualNetwork>,
+    bounds: [[f64; 2]; 2],
+    residual: Option<ResidualNetwork>,
 }
 
 impl ProjectiveMap {
@@ -204,14 +242,14 @@ impl ProjectiveMap {
 }
 
 /// Map and inverse camera for inference.
-#[derive(Debug, Clone)]
-pub(crate) struct ProjectiveEncoder {
-    pub(crate) map: ProjectiveMap,
-    pub(crate) decoder: InverseCamera,
+#[derive(Debug)]
+struct ProjectiveEncoder {
+    map: ProjectiveMap,
+    decoder: InverseCamera,
 }
 
 impl ProjectiveEncoder {
-    pub(super) fn build(parts: &mut ModelParts) -> Result<Self> {
+    fn build(parts: &mut ModelParts) -> Result<Self> {
         let scales = parts.scales(FEATURES)?;
         let coefficients = parts.tensors.take_f64("projection", &[COEFFICIENTS])?;
         let (centre, unit_m) = parts.position_scale()?;
@@ -229,16 +267,20 @@ impl ProjectiveEncoder {
         let decoder = InverseCamera::take(&mut parts.tensors)?;
         Ok(Self { map: ProjectiveMap { projection, bounds, residual }, decoder })
     }
+}
 
-    /// Position and reconstruction of a box.
-    #[inline]
-    pub(crate) fn encode(&self, bounding_box: &BoundingBox) -> Encoded {
+impl Encoder for ProjectiveEncoder {
+    fn encode(&self, _plane: &LocalPlane, bounding_box: &BoundingBox) -> Encoded {
         let position = self.map.position(bounding_box);
         let projection = &self.map.projection;
         let features = self.decoder.features_at(projection.in_units(position));
         let reconstruction_px =
             std::array::from_fn(|at| projection.scales[at][0] + projection.scales[at][1] * features[at]);
         Encoded { position, reconstruction_px }
+    }
+
+    fn express<'g>(&self, context: &GraphContext<'_, 'g>) -> Answer<'g> {
+        context.calibrated(onnx::encode(self, context.boxes))
     }
 }
 

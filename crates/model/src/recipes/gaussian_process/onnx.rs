@@ -1,17 +1,18 @@
 //! The recipe `gaussian_process`: the mixture of its maps with their covariance, and the test of a box's
-//! plausibility. The formulas are those of `encoder/gaussian_process/predictor.rs` for a box alone.
+//! plausibility. The formulas are those of `predictor.rs` for a box alone.
 
-use super::boxes::Boxes;
-use super::expression::Expr;
-use super::plane::piecewise_linear;
-use crate::recipes::gaussian_process::box_plausibility::{BoxPlausibility, MAX_LOG_SIDE};
-use crate::recipes::gaussian_process::kernel::SQRT_5;
-use crate::recipes::gaussian_process::predictor::{
+use super::box_plausibility::{BoxPlausibility, MAX_LOG_SIDE};
+use super::kernel::SQRT_5;
+use super::predictor::{
     CoefficientDeviation, PositionMap, Predictor, QUANTILES, SHRINKAGE, UNEXPLAINED_SHARE,
 };
-use crate::recipes::gaussian_process::projective_mean::{
-    COEFFICIENTS, MAX_SIDE, MIN_DENOMINATOR, ProjectiveMean,
-};
+use super::projective_mean::{COEFFICIENTS, MAX_SIDE, MIN_DENOMINATOR, ProjectiveMean};
+use super::recipe::GaussianProcessEncoder;
+use crate::onnx::answer::{Answer, GraphContext};
+use crate::onnx::boxes::{Boxes, reconstruction_error};
+use crate::onnx::expression::Expr;
+use crate::onnx::network;
+use crate::onnx::plane::{self, piecewise_linear};
 
 /// Numbers of a cell in a table: centre 2, coefficients 6, whitening 3, leverage 6.
 const CELL_NUMBERS: usize = 17;
@@ -21,19 +22,36 @@ type Sides<'g> = [Expr<'g>; 4];
 /// East, cross, north, m2.
 type Covariance<'g> = [Expr<'g>; 3];
 
-/// The answer for a box.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct MapEstimate<'g> {
-    /// East and north, m.
-    pub(super) position_m: [Expr<'g>; 2],
-    pub(super) covariance_m2: Covariance<'g>,
-    /// The 95 % radius in standard deviations per axis.
-    pub(super) r95_scale: Expr<'g>,
-    /// The plausible box's features, px.
-    pub(super) plausible_px: Sides<'g>,
+/// The answer of an encoder.
+pub(super) fn express<'g>(encoder: &GaussianProcessEncoder, context: &GraphContext<'_, 'g>) -> Answer<'g> {
+    let boxes = context.boxes;
+    let estimate = estimate(&encoder.predictor, boxes);
+    let reconstruction_px = match &encoder.auto_encoder {
+        Some(auto_encoder) => network::auto_encoder(auto_encoder, boxes).1,
+        None => context.graph().columns(&estimate.plausible_px),
+    };
+    Answer {
+        position_m: estimate.position_m,
+        position_deg: plane::to_position(context.plane, estimate.position_m),
+        covariance_m2: estimate.covariance_m2,
+        r95_scale: estimate.r95_scale,
+        reconstruction_error: reconstruction_error(boxes.features(), reconstruction_px),
+    }
 }
 
-pub(super) fn estimate<'g>(predictor: &Predictor, boxes: Boxes<'g>) -> MapEstimate<'g> {
+/// The answer for a box.
+#[derive(Debug, Clone, Copy)]
+struct MapEstimate<'g> {
+    /// East and north, m.
+    position_m: [Expr<'g>; 2],
+    covariance_m2: Covariance<'g>,
+    /// The 95 % radius in standard deviations per axis.
+    r95_scale: Expr<'g>,
+    /// The plausible box's features, px.
+    plausible_px: Sides<'g>,
+}
+
+fn estimate<'g>(predictor: &Predictor, boxes: Boxes<'g>) -> MapEstimate<'g> {
     let sides = boxes.features();
     let Mixture { position_m, map_m2, by_edge } = mix(predictor, sides);
     let noise_m2 = quadratic(by_edge, &predictor.edge_px2);

@@ -1,11 +1,11 @@
 //! The recipe `projective`: the map of `encoder/projection.rs` with its residual network, and the inverse camera.
 
-use super::boxes::Boxes;
-use super::expression::Expr;
-use super::network::first_hidden;
+use super::ProjectiveEncoder;
 use crate::encoder::inverse_camera::{self, InverseCamera};
 use crate::encoder::projection::{self, Projection, TERMS};
-use crate::recipes::projective::ProjectiveEncoder;
+use crate::onnx::boxes::Boxes;
+use crate::onnx::expression::Expr;
+use crate::onnx::network::first_hidden;
 
 /// Position (east and north, m) and reconstructed features, px.
 pub(super) fn encode<'g>(encoder: &ProjectiveEncoder, boxes: Boxes<'g>) -> (Expr<'g>, Expr<'g>) {

@@ -71,6 +71,7 @@ pub use retention::{ClockDoubt, Retention, retention_doubt};
 pub use samples::{ImportOptions, ImportReport, RejectedRow};
 pub use site_registry::{ActiveSite, SiteRegistry};
 pub use site_training::SiteRunRequest;
+pub use sites::Sites;
 pub use spool::{Content, Spool, SpoolLeases, Spooled};
 pub use training::{RunRequest, Trainable};
 

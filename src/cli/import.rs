@@ -108,7 +108,7 @@ impl Import {
     /// Creates the camera and its site, as far as they do not exist.
     async fn create_camera(&self, app: &App) -> anyhow::Result<()> {
         if let Some(site) = &self.site {
-            match app.create_site(NewSite::named(site.clone())).await {
+            match app.sites().create(NewSite::named(site.clone())).await {
                 Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::SiteExists => {}
                 created => drop(created?),
             }

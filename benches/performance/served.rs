@@ -68,9 +68,9 @@ impl Served {
 
     /// Trains and waits.
     pub(crate) async fn train(&self, request: RunRequest) {
-        let run = self.app.start_run(&self.camera, request, None).await.expect("a run");
+        let run = self.app.training().start(&self.camera, request, None).await.expect("a run");
         loop {
-            let run = self.app.run(&self.camera, run.id).await.expect("the run");
+            let run = self.app.training().get(&self.camera, run.id).await.expect("the run");
             if run.state.has_ended() {
                 assert!(run.model_version.is_some(), "{:?}", run.outcome);
                 return;

@@ -73,7 +73,7 @@ pub use site_registry::{ActiveSite, SiteRegistry};
 pub use site_training::SiteRunRequest;
 pub use sites::Sites;
 pub use spool::{Content, Spool, SpoolLeases, Spooled};
-pub use training::{RunRequest, Trainable};
+pub use training::{RunRequest, Trainable, Training, TrainingQueues};
 
 /// The application: everything a request needs, on behalf of its caller. Cheap to clone.
 #[derive(Clone)]
@@ -113,9 +113,7 @@ pub struct Parts {
     /// Places for recordings that are paired in memory.
     pub pairings: Arc<Semaphore>,
     /// Notifies workers of queued training runs.
-    pub training_queue: JobQueue,
-    /// Notifies workers of queued training runs of sites.
-    pub site_training_queue: JobQueue,
+    pub training_queues: TrainingQueues,
     /// Notifies workers of queued evaluations.
     pub evaluation_queue: JobQueue,
     /// Which nodes there are, and what this one owns.
@@ -171,8 +169,7 @@ impl App {
             quotas,
             metrics,
             pairings,
-            training_queue: JobQueue::default(),
-            site_training_queue: JobQueue::default(),
+            training_queues: TrainingQueues::default(),
             evaluation_queue: JobQueue::default(),
             cluster: Cluster::default(),
             stream_slots: live::StreamSlots::default(),

@@ -138,7 +138,7 @@ impl SiteService for Sites {
                 from: instant(asked.from, "from")?,
                 until: instant(asked.until, "until")?,
             };
-            let run = app.start_run(&site_id(&asked.site_id)?, options, idempotent).await?;
+            let run = app.training().start(&site_id(&asked.site_id)?, options, idempotent).await?;
             Ok(proto::StartSiteTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -149,7 +149,7 @@ impl SiteService for Sites {
         request: tonic::Request<proto::GetSiteTrainingRunRequest>,
     ) -> Reply<proto::GetSiteTrainingRunResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let run = app.run(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
+            let run = app.training().get(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::GetSiteTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -162,7 +162,7 @@ impl SiteService for Sites {
         answer(&self.app, request, |app, asked| async move {
             let site = site_id(&asked.site_id)?;
             let size = pages::size(asked.page_size, &app.limits)?;
-            let page = app.runs(&site, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
+            let page = app.training().list(&site, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
             Ok(proto::ListSiteTrainingRunsResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 runs: page.items.into_iter().map(Into::into).collect(),
@@ -176,7 +176,7 @@ impl SiteService for Sites {
         request: tonic::Request<proto::CancelSiteTrainingRunRequest>,
     ) -> Reply<proto::CancelSiteTrainingRunResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let run = app.cancel_run(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
+            let run = app.training().cancel(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::CancelSiteTrainingRunResponse { run: Some(run.into()) })
         })
         .await

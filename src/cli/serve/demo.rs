@@ -61,9 +61,9 @@ pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
 }
 
 async fn train(app: &App, id: &CameraId) -> anyhow::Result<()> {
-    let run = app.start_run(id, RunRequest::default(), None).await?;
+    let run = app.training().start(id, RunRequest::default(), None).await?;
     let mut progress = Progress::new("training the demonstration {bar:40} {pos}/{len}");
-    let mut changes = std::pin::pin!(app.watch_run(id, run.id).await?);
+    let mut changes = std::pin::pin!(app.training().watch(id, run.id).await?);
     while let Some(run) = changes.next().await {
         let run = run?;
         progress.set(run.progress.epoch.into(), run.progress.epochs.into(), "epochs of the demonstration");

@@ -151,7 +151,7 @@ async fn start_site_training_run(
         request.hasher.update(body.bytes());
     }
     let draft = body.read_or_default::<SiteRunDraft>()?;
-    let run = app.start_run(&id, draft.to_domain()?, idempotent).await?;
+    let run = app.training().start(&id, draft.to_domain()?, idempotent).await?;
     let location = format!("/v1/sites/{id}/training-runs/{}", run.id);
     Ok(created(StatusCode::ACCEPTED, &location, &SiteTrainingRun::from(run))?)
 }
@@ -171,7 +171,7 @@ async fn list_site_training_runs(CallerApp(app): CallerApp, SitePath(id): SitePa
     let limit = params.limit(app.limits.page_items)?;
     let before = params.cursor()?;
     params.end()?;
-    let page = app.runs(&id, before, limit).await?;
+    let page = app.training().list(&id, before, limit).await?;
     Ok(json(&SiteRunPage {
         items: page.items.into_iter().map(SiteTrainingRun::from).collect(),
         next_cursor: page.next.map(|run| write_cursor(&run)),
@@ -185,7 +185,7 @@ async fn list_site_training_runs(CallerApp(app): CallerApp, SitePath(id): SitePa
     responses((status = 200, description = "The run", body = SiteTrainingRun))
 )]
 async fn get_site_training_run(CallerApp(app): CallerApp, SiteRunPath(id, run): SiteRunPath) -> ApiResult {
-    Ok(json(&SiteTrainingRun::from(app.run(&id, run).await?))?)
+    Ok(json(&SiteTrainingRun::from(app.training().get(&id, run).await?))?)
 }
 
 /// Cancel a training run of a site
@@ -200,5 +200,5 @@ async fn get_site_training_run(CallerApp(app): CallerApp, SiteRunPath(id, run): 
     )
 )]
 async fn cancel_site_training_run(CallerApp(app): CallerApp, SiteRunPath(id, run): SiteRunPath) -> ApiResult {
-    Ok(json(&SiteTrainingRun::from(app.cancel_run(&id, run).await?))?)
+    Ok(json(&SiteTrainingRun::from(app.training().cancel(&id, run).await?))?)
 }

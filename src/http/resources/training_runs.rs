@@ -183,7 +183,7 @@ async fn start_training_run(
     if let Some(request) = &idempotent {
         request.hasher.update(body.bytes());
     }
-    let run = app.start_run(&id, body.read_or_default::<RunDraft>()?.to_domain()?, idempotent).await?;
+    let run = app.training().start(&id, body.read_or_default::<RunDraft>()?.to_domain()?, idempotent).await?;
     let location = format!("/v1/cameras/{id}/training-runs/{}", run.id);
     Ok(created(StatusCode::ACCEPTED, &location, &TrainingRun::from(run))?)
 }
@@ -203,7 +203,7 @@ async fn list_training_runs(CallerApp(app): CallerApp, CameraPath(id): CameraPat
     let limit = params.limit(app.limits.page_items)?;
     let before = params.cursor()?;
     params.end()?;
-    let page = app.runs(&id, before, limit).await?;
+    let page = app.training().list(&id, before, limit).await?;
     Ok(json(&RunPage {
         items: page.items.into_iter().map(TrainingRun::from).collect(),
         next_cursor: page.next.map(|run| write_cursor(&run)),
@@ -217,7 +217,7 @@ async fn list_training_runs(CallerApp(app): CallerApp, CameraPath(id): CameraPat
     responses((status = 200, description = "The run", body = TrainingRun))
 )]
 async fn get_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
-    Ok(json(&TrainingRun::from(app.run(&id, run).await?))?)
+    Ok(json(&TrainingRun::from(app.training().get(&id, run).await?))?)
 }
 
 /// Delete a training run
@@ -233,7 +233,7 @@ async fn get_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) 
     )
 )]
 async fn delete_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
-    app.delete_run(&id, run).await?;
+    app.training().delete(&id, run).await?;
     Ok(empty())
 }
 
@@ -249,7 +249,7 @@ async fn delete_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPat
     )
 )]
 async fn cancel_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
-    Ok(json(&TrainingRun::from(app.cancel_run(&id, run).await?))?)
+    Ok(json(&TrainingRun::from(app.training().cancel(&id, run).await?))?)
 }
 
 /// Watch a training run
@@ -282,7 +282,7 @@ async fn watch_training_run(
         return Ok(empty());
     }
     let lease = app.quotas.event_streams.try_acquire(client, 1)?;
-    let changes = app.watch_run(&id, run).await?;
+    let changes = app.training().watch(&id, run).await?;
     let shutdown = rest.shutdown.clone();
     let events = changes.take_until(async move { shutdown.draining().await }).filter_map(move |change| {
         let _held = &lease; // until the stream is dropped
@@ -335,7 +335,7 @@ struct TrainingLog {
     responses((status = 200, description = "The log", body = TrainingLog))
 )]
 async fn get_training_log(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
-    let lines = app.run_log(&id, run).await?;
+    let lines = app.training().log(&id, run).await?;
     Ok(json(&TrainingLog { items: lines.into_iter().map(|(time, text)| LogLine { time, text }).collect() })?)
 }
 
@@ -353,5 +353,5 @@ struct TrainingCurve {
     responses((status = 200, description = "The curve", body = TrainingCurve))
 )]
 async fn get_training_curve(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
-    Ok(json(&TrainingCurve { items: app.run_epochs(&id, run).await? })?)
+    Ok(json(&TrainingCurve { items: app.training().epochs(&id, run).await? })?)
 }

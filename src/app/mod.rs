@@ -53,7 +53,7 @@ pub use connections::{
     ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, CountedReason,
     LastMessage, LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
 };
-pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
+pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest, Evaluations};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
 pub use learning::{Learning, LearningState};
 pub use live::{

@@ -258,7 +258,7 @@ struct EvaluationPage {
 )]
 async fn start_evaluation(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
     let draft: EvaluationDraft = body.read()?;
-    let job = app.start_evaluation(&camera_of(&draft.camera_id)?, draft.to_domain()?).await?;
+    let job = app.evaluations().start(&camera_of(&draft.camera_id)?, draft.to_domain()?).await?;
     let location = format!("/v1/evaluations/{}", job.id);
     Ok(created(StatusCode::ACCEPTED, &location, &Evaluation::from(job))?)
 }
@@ -282,7 +282,7 @@ async fn list_evaluations(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let limit = params.limit(app.limits.page_items)?;
     let before = params.cursor()?;
     params.end()?;
-    let page = app.evaluations(camera.as_ref(), before, limit).await?;
+    let page = app.evaluations().list(camera.as_ref(), before, limit).await?;
     Ok(json(&EvaluationPage {
         items: page.items.into_iter().map(Evaluation::from).collect(),
         next_cursor: page.next.map(|id| write_cursor(&id)),
@@ -299,7 +299,7 @@ async fn list_evaluations(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     )
 )]
 async fn get_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): EvaluationPath) -> ApiResult {
-    let (job, report) = app.evaluation(id).await?;
+    let (job, report) = app.evaluations().get(id).await?;
     let report = report.map(RawValue::from_string).transpose().map_err(Error::fault)?;
     Ok(json(&Evaluation { report, ..Evaluation::from(job) })?)
 }
@@ -317,7 +317,7 @@ async fn get_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): Evaluatio
     )
 )]
 async fn cancel_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): EvaluationPath) -> ApiResult {
-    Ok(json(&Evaluation::from(app.cancel_evaluation(id).await?))?)
+    Ok(json(&Evaluation::from(app.evaluations().cancel(id).await?))?)
 }
 
 /// Delete an evaluation
@@ -332,6 +332,6 @@ async fn cancel_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): Evalua
     )
 )]
 async fn delete_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): EvaluationPath) -> ApiResult {
-    app.delete_evaluation(id).await?;
+    app.evaluations().delete(id).await?;
     Ok(empty())
 }

@@ -26,6 +26,7 @@ mod recording;
 mod registry;
 mod retention;
 mod samples;
+mod sessions;
 mod site_registry;
 mod site_training;
 mod sites;
@@ -55,6 +56,7 @@ pub use connections::{
 };
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest, Evaluations};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
+pub use keys::Keys;
 pub use learning::{Learning, LearningState};
 pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
@@ -69,6 +71,7 @@ pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedPar
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
 pub use retention::{ClockDoubt, Retention, retention_doubt};
 pub use samples::{ImportOptions, ImportReport, RejectedRow};
+pub use sessions::Sessions;
 pub use site_registry::{ActiveSite, SiteRegistry};
 pub use site_training::SiteRunRequest;
 pub use sites::Sites;

@@ -23,7 +23,7 @@ pub(crate) fn run() {
         let mut cameras = Vec::new();
         for number in 0..cores {
             let id = CameraId::new(&format!("busy-{number}")).expect("a slug");
-            served.app.create_camera(NewCamera::named(id.clone())).await.expect("a new camera");
+            served.app.cameras().create(NewCamera::named(id.clone())).await.expect("a new camera");
             served
                 .app
                 .store

@@ -50,7 +50,7 @@ impl Served {
         let camera = CameraId::new("bench").expect("a slug");
         let world = simulate(&Options::demo());
         let profile = NewCamera { image_size: Some(world.image_size), ..NewCamera::named(camera.clone()) };
-        app.create_camera(profile).await.expect("a new camera");
+        app.cameras().create(profile).await.expect("a new camera");
         let samples = world.training_samples();
         let observations = samples
             .iter()

@@ -49,6 +49,7 @@ use crate::store::{Location, Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use camera_statuses::CameraStatus;
+pub use cameras::Cameras;
 pub use cluster::{CameraLease, Cluster, ConnectionLease, DatabaseHistory, NodeSettings, NodeStatus, Watch};
 pub use connections::{
     ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, CountedReason,
@@ -65,7 +66,7 @@ pub use live::{
     TrackPoint, UnplacedBox, WantedPositions, WorldSighting, WorldTrackPoint,
 };
 pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
-pub use models::GnssErrorEstimate;
+pub use models::{GnssErrorEstimate, Models};
 pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};

@@ -262,8 +262,8 @@ pub(super) struct Camera {
 impl Camera {
     pub(super) fn of(app: &App, camera: domain::Camera) -> Self {
         let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
-        let model_fault = app.model_fault(camera.id()).map(|fault| fault.reason);
-        let warnings = app.camera_warnings(&camera);
+        let model_fault = app.models().fault(camera.id()).map(|fault| fault.reason);
+        let warnings = app.cameras().warnings(&camera);
         let domain::Camera { profile, revision, created_at, updated_at, active_model, samples, key: _ } =
             camera;
         Self {
@@ -345,7 +345,7 @@ struct CameraPage {
     )
 )]
 async fn create_camera(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
-    let camera = app.create_camera(body.read::<CameraDraft>()?.into_domain()?).await?;
+    let camera = app.cameras().create(body.read::<CameraDraft>()?.into_domain()?).await?;
     let (location, version) = (format!("/v1/cameras/{}", camera.id()), camera.version());
     Ok(with_etag(created(StatusCode::CREATED, &location, &Camera::of(&app, camera))?, version).await?)
 }
@@ -369,7 +369,7 @@ async fn list_cameras(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let after = params.cursor()?;
     let site = params.take("site", site_of)?;
     params.end()?;
-    let page = app.cameras(site.as_ref(), after.as_ref(), limit).await?;
+    let page = app.cameras().list(site.as_ref(), after.as_ref(), limit).await?;
     Ok(json(&CameraPage {
         items: page.items.into_iter().map(|camera| Camera::of(&app, camera)).collect(),
         next_cursor: page.next.map(|id| write_cursor(&id)),
@@ -389,7 +389,7 @@ async fn list_cameras(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     )
 )]
 async fn get_camera(CallerApp(app): CallerApp, CameraPath(id): CameraPath, headers: HeaderMap) -> ApiResult {
-    let camera = app.camera(&id).await?;
+    let camera = app.cameras().get(&id).await?;
     let version = camera.version();
     let response = with_etag(json(&Camera::of(&app, camera))?, version).await?;
     Ok(unless_known(&headers, response))
@@ -422,9 +422,9 @@ async fn change_camera(
     let expected = etag::required(&headers)?;
     let patch = body.read::<JsonObject>()?;
     let change = || async {
-        let camera = app.camera(&id).await?;
+        let camera = app.cameras().get(&id).await?;
         let version = expected.unwrap_or(camera.version());
-        app.change_camera(&id, patched(&app, camera, &patch)?, Some(version)).await
+        app.cameras().change(&id, patched(&app, camera, &patch)?, Some(version)).await
     };
     let changed = merge_patch::retried(expected.is_some(), change).await?;
     let version = changed.version();
@@ -449,6 +449,6 @@ async fn delete_camera(
     CameraPath(id): CameraPath,
     headers: HeaderMap,
 ) -> ApiResult {
-    app.delete_camera(&id, etag::optional(&headers)?).await?;
+    app.cameras().delete(&id, etag::optional(&headers)?).await?;
     Ok(empty())
 }

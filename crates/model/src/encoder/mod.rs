@@ -1,4 +1,4 @@
-//! What the recipes share: from a box to a position with its error, and back to the box that belongs to the position.
+//! Parts that recipes share: from a box to a position with its error, and back to the box that belongs to the position.
 
 pub(crate) mod auto_encoder;
 pub(crate) mod features;

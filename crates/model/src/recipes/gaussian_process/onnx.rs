@@ -7,7 +7,7 @@ use super::predictor::{
     CoefficientDeviation, PositionMap, Predictor, QUANTILES, SHRINKAGE, UNEXPLAINED_SHARE,
 };
 use super::projective_mean::{COEFFICIENTS, MAX_SIDE, MIN_DENOMINATOR, ProjectiveMean};
-use super::recipe::GaussianProcessEncoder;
+use crate::encoder::auto_encoder::AutoEncoder;
 use crate::onnx::answer::{Answer, GraphContext};
 use crate::onnx::boxes::{Boxes, reconstruction_error};
 use crate::onnx::expression::Expr;
@@ -23,10 +23,14 @@ type Sides<'g> = [Expr<'g>; 4];
 type Covariance<'g> = [Expr<'g>; 3];
 
 /// The answer of an encoder.
-pub(super) fn express<'g>(encoder: &GaussianProcessEncoder, context: &GraphContext<'_, 'g>) -> Answer<'g> {
+pub(super) fn express<'g>(
+    predictor: &Predictor,
+    auto_encoder: Option<&AutoEncoder>,
+    context: &GraphContext<'_, 'g>,
+) -> Answer<'g> {
     let boxes = context.boxes;
-    let estimate = estimate(&encoder.predictor, boxes);
-    let reconstruction_px = match &encoder.auto_encoder {
+    let estimate = estimate(predictor, boxes);
+    let reconstruction_px = match auto_encoder {
         Some(auto_encoder) => network::auto_encoder(auto_encoder, boxes).1,
         None => context.graph().columns(&estimate.plausible_px),
     };

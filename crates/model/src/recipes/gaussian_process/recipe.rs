@@ -225,10 +225,10 @@ fn note(report: &FitReport, phase: &mut Phase<'_, '_>) -> Result<(), FitError> {
 
 /// The encoder of a loaded model.
 #[derive(Debug)]
-pub(super) struct GaussianProcessEncoder {
-    pub(super) predictor: Predictor,
+struct GaussianProcessEncoder {
+    predictor: Predictor,
     /// Fits of parts of the rows have none.
-    pub(super) auto_encoder: Option<AutoEncoder>,
+    auto_encoder: Option<AutoEncoder>,
 }
 
 impl GaussianProcessEncoder {
@@ -281,7 +281,7 @@ impl Encoder for GaussianProcessEncoder {
     }
 
     fn express<'g>(&self, context: &GraphContext<'_, 'g>) -> Answer<'g> {
-        onnx::express(self, context)
+        onnx::express(&self.predictor, self.auto_encoder.as_ref(), context)
     }
 
     fn widened(&self, common_m2: PlaneCovariance) -> PlaneCovariance {

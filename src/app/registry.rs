@@ -11,6 +11,7 @@ use arc_swap::ArcSwap;
 use jiff::Timestamp;
 use tokio::sync::Mutex;
 
+use super::access::Caller;
 use super::live::camera::CameraLive;
 use crate::domain::{
     CameraId, CameraKey, CameraMoved, Error, ErrorKind, GnssError, HeldOutError, ImageSize, ModelMetadata,
@@ -140,6 +141,23 @@ impl Registry {
     /// The first camera that a rule selects; it is asked of no camera after that.
     pub(super) fn find(&self, rule: impl Fn(&ActiveCamera) -> bool) -> Option<Arc<ActiveCamera>> {
         self.cameras.load().values().find(|camera| rule(camera)).cloned()
+    }
+
+    /// The active camera of an id; looks into the store for one that another process has made.
+    ///
+    /// # Errors
+    /// `PermissionDenied` if the caller is a device of other cameras; `CameraNotFound`; a fault of the store.
+    pub(super) async fn active_camera(
+        &self,
+        store: &Store,
+        caller: &Caller,
+        id: &CameraId,
+    ) -> Result<Arc<ActiveCamera>> {
+        caller.authorize_camera(id)?;
+        match self.get(id) {
+            Some(camera) => Ok(camera),
+            None => self.refresh_camera(store, id).await,
+        }
     }
 
     /// Brings one camera up to date with the store.

@@ -370,7 +370,7 @@ fn print_match(summary: &Summary, report: &MatchReport) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What was matched, in the names of the answer over REST, and the scores of the search without a model.
+/// The matched rows, in the names of the answer over REST, and the scores of the search without a model.
 fn match_document(report: &MatchReport) -> serde_json::Value {
     let pair = |pair: &MatchedPair| {
         serde_json::json!({

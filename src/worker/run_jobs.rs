@@ -73,7 +73,7 @@ impl<S: Trained> Job for TrainingRun<S> {
     }
 
     fn queue(app: &App) -> &JobQueue {
-        S::queue(app)
+        S::queue(&app.training_queues)
     }
 
     fn metrics(metrics: &Metrics) -> &JobMetrics {

@@ -143,7 +143,7 @@ const table = {
   'camera.id': ['Id', 'Id'],
   'camera.id.help': ['Lower-case letters, digits and hyphens. It cannot be changed later.', 'Kleinbuchstaben, Ziffern und Bindestriche. Später nicht änderbar.'],
   'camera.model': ['Active model', 'Aktives Modell'],
-  'camera.moved.text': ['Since about {began} its positions are off by {shift} on average ({targets} targets agree). The stated radius contains this shift until a new model is active.', 'Seit etwa {began} sind die Positionen im Mittel um {shift} verschoben ({targets} Ziele stimmen überein). Der angegebene Radius enthält diese Verschiebung, bis ein neues Modell aktiv ist.'],
+  'camera.moved.text': ['Since about {onset} its positions are off by {shift} on average ({targets} targets agree). The stated radius contains this shift until a new model is active.', 'Seit etwa {onset} sind die Positionen im Mittel um {shift} verschoben ({targets} Ziele stimmen überein). Der angegebene Radius enthält diese Verschiebung, bis ein neues Modell aktiv ist.'],
   'camera.name': ['Name', 'Name'],
   'camera.name.example': ['North gate', 'Nordtor'],
   'camera.new': ['Add camera', 'Kamera hinzufügen'],
@@ -416,11 +416,12 @@ const table = {
   'job.running': ['running', 'läuft'],
   'job.succeeded': ['succeeded', 'erfolgreich'],
 
+  // The recipes, in the order in which they are offered: lib/recipes.ts takes their names from here.
   'recipe.auto': ['The best of the candidates on held-out blocks of time. The default, and the right choice unless you know better.', 'Der beste Kandidat auf zurückgehaltenen Zeitblöcken. Die Voreinstellung und meist die richtige Wahl.'],
-  'recipe.gaussianProcess': ['A projective map with a Gaussian-process residual. Its stated error counts receivers, not rows.', 'Eine projektive Abbildung mit Gauß-Prozess-Rest. Ihr angegebener Fehler zählt Empfänger, nicht Zeilen.'],
+  'recipe.gaussian_process': ['A projective map with a Gaussian-process residual. Its stated error counts receivers, not rows.', 'Eine projektive Abbildung mit Gauß-Prozess-Rest. Ihr angegebener Fehler zählt Empfänger, nicht Zeilen.'],
+  'recipe.projective': ['A homography of the foot point with a small residual network. Fast.', 'Eine Homographie des Fußpunkts mit kleinem Restnetz. Schnell.'],
   'recipe.hybrid': ['An auto-encoder with the hybrid loss in metres, on scaled inputs.', 'Ein Autoencoder mit hybridem Verlust in Metern auf skalierten Eingaben.'],
   'recipe.paper': ['The method of the paper to the letter, for comparison.', 'Das Verfahren der Veröffentlichung, zum Vergleich.'],
-  'recipe.projective': ['A homography of the foot point with a small residual network. Fast.', 'Eine Homographie des Fußpunkts mit kleinem Restnetz. Schnell.'],
 
   'training.advice': ['What would help', 'Was helfen würde'],
   'training.chart': ['Errors by epoch', 'Fehler je Epoche'],

@@ -35,18 +35,20 @@ const GNSS_LOSS_S: i64 = 20;
 pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
     let id = CameraId::new(CAMERA)?;
     let world = simulate(&Options::demo());
-    if app.cameras(None, None, 1).await?.items.is_empty() {
+    if app.cameras().list(None, None, 1).await?.items.is_empty() {
         let sigma_m = SigmaM::new(world.gnss_sigma_m)?;
-        app.create_camera(NewCamera {
-            display_name: "Demonstration: a simulated square".to_owned(),
-            image_size: Some(world.image_size),
-            gnss_error: GnssError::Known(sigma_m),
-            ..NewCamera::named(id.clone())
-        })
-        .await?;
+        app.cameras()
+            .create(NewCamera {
+                display_name: "Demonstration: a simulated square".to_owned(),
+                image_size: Some(world.image_size),
+                gnss_error: GnssError::Known(sigma_m),
+                ..NewCamera::named(id.clone())
+            })
+            .await?;
         app.store.insert_samples(&id, world.training_samples(), Durability::Synced).await?;
     }
-    let camera = app.camera(&id).await.context("the data folder holds other cameras; choose an empty one")?;
+    let camera =
+        app.cameras().get(&id).await.context("the data folder holds other cameras; choose an empty one")?;
     if camera.active_model.is_none() {
         train(app, &id).await?;
     }
@@ -61,9 +63,9 @@ pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
 }
 
 async fn train(app: &App, id: &CameraId) -> anyhow::Result<()> {
-    let run = app.start_run(id, RunRequest::default(), None).await?;
+    let run = app.training().start(id, RunRequest::default(), None).await?;
     let mut progress = Progress::new("training the demonstration {bar:40} {pos}/{len}");
-    let mut changes = std::pin::pin!(app.watch_run(id, run.id).await?);
+    let mut changes = std::pin::pin!(app.training().watch(id, run.id).await?);
     while let Some(run) = changes.next().await {
         let run = run?;
         progress.set(run.progress.epoch.into(), run.progress.epochs.into(), "epochs of the demonstration");

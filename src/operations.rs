@@ -27,6 +27,7 @@ pub const OPERATIONS: &[Operation] = &[
     operation(Public, "GET /readyz", "grpc.health.v1.Health/Watch"),
     operation(Read, "GET /metrics", ""),
     operation(Read, "GET /v1/server", ""),
+    operation(Operate, "DELETE /v1/demonstration", ""),
     operation(Read, "GET /v1/nodes", ""),
     operation(Read, "GET /v1/tiles", ""),
     operation(Read, "GET /v1/camera-statuses", ""),

@@ -11,6 +11,7 @@ mod camera_statuses;
 mod cameras;
 mod cluster;
 mod connections;
+mod demonstration;
 mod evaluations;
 mod fusion;
 mod idempotency;
@@ -53,6 +54,7 @@ pub use connections::{
     ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, CountedReason,
     LastMessage, LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
 };
+pub use demonstration::{Demonstration, DemonstrationParts};
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
 pub use learning::{Learning, LearningState};
@@ -117,6 +119,8 @@ pub struct Parts {
     pub site_training_queue: JobQueue,
     /// Notifies workers of queued evaluations.
     pub evaluation_queue: JobQueue,
+    /// The demonstration, if one is shown.
+    pub demonstration: Demonstration,
     /// Which nodes there are, and what this one owns.
     cluster: Cluster,
     /// Open live streams.
@@ -173,6 +177,7 @@ impl App {
             training_queue: JobQueue::default(),
             site_training_queue: JobQueue::default(),
             evaluation_queue: JobQueue::default(),
+            demonstration: Demonstration::default(),
             cluster: Cluster::default(),
             stream_slots: live::StreamSlots::default(),
             matching_slot: live::MatchingSlot::default(),

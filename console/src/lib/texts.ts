@@ -19,9 +19,30 @@ const table = {
   'action.save': ['Save', 'Speichern'],
   'action.stop': ['Stop', 'Anhalten'],
 
+  'aerial.adjust': ['Drag its corners', 'Ecken verschieben'],
+  'aerial.drop': ['Drop an aerial image', 'Luftbild hier ablegen'],
+  'aerial.formats': [
+    'PNG, JPEG or WebP, also with its world file; or a georeferenced TIFF. Coordinates are degrees or metres of EPSG:3857; an image without a place is put into the middle of the map.',
+    'PNG, JPEG oder WebP, auch mit World-Datei; oder ein georeferenziertes TIFF. Koordinaten sind Grad oder Meter von EPSG:3857; ein Bild ohne Ort kommt in die Mitte der Karte.',
+  ],
+  'aerial.lowerLeft': ['Lower left corner of the image', 'Linke untere Ecke des Bildes'],
+  'aerial.lowerRight': ['Lower right corner of the image', 'Rechte untere Ecke des Bildes'],
+  'aerial.none': ['None of these files is an image.', 'Keine dieser Dateien ist ein Bild.'],
+  'aerial.placed': ['The image is on the map, where its file says.', 'Das Bild liegt auf der Karte, wo seine Datei es angibt.'],
+  'aerial.settle': ['The image lies right', 'Das Bild liegt richtig'],
+  'aerial.text': ['It lies under everything on the maps of this browser, which keeps it; it is not sent to the server.', 'Es liegt auf den Karten dieses Browsers unter allem anderen. Der Browser behält es; es wird nicht zum Server geschickt.'],
+  'aerial.title': ['Aerial image', 'Luftbild'],
+  'aerial.upperLeft': ['Upper left corner of the image', 'Linke obere Ecke des Bildes'],
+  'aerial.upperRight': ['Upper right corner of the image', 'Rechte obere Ecke des Bildes'],
+
   'age.ago': ['{time} ago', 'vor {time}'],
   'age.never': ['never', 'nie'],
   'age.now': ['now', 'jetzt'],
+
+  'demonstration.end': ['End it and remove its cameras', 'Beenden und ihre Kameras entfernen'],
+  'demonstration.ended': ['The demonstration has ended.', 'Die Vorführung ist beendet.'],
+  'demonstration.text': ['Everything here is simulated: people, carts, a ship, cameras and phones.', 'Alles hier ist simuliert: Menschen, Wagen, ein Schiff, Kameras und Telefone.'],
+  'demonstration.title': ['Demonstration', 'Vorführung'],
 
   // What the flags of a position mean, by their name.
   'flag.gnss_denied': ['No fix came with the box: the position is from the box alone.', 'Zur Box kam kein Fix: Die Position stammt nur aus der Box.'],

@@ -322,6 +322,8 @@ export interface EvaluationReport {
 export interface ServerInfo {
   version: string;
   limits: Record<string, number>;
+  /** Whether what the server answers is simulated. */
+  demonstration: boolean;
   tiles?: Tiles;
   /** Tiles of another server, which is asked once the user agrees. */
   offered_tiles?: Tiles;

@@ -24,7 +24,7 @@ const LINE_M: f64 = 40.0;
 const SLAB_M: f64 = 3.0;
 const JOINT_M: f64 = 0.12;
 /// Distance at which details have faded to 1/e, m.
-const HAZE_M: f64 = 90.0;
+const HAZE_M: f64 = 220.0;
 
 /// A picture without targets: rows of pixels from the upper left corner, each of red, green and blue.
 #[derive(Debug, Clone, PartialEq, Eq)]

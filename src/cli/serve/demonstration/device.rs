@@ -90,7 +90,7 @@ impl Source {
 pub(super) fn phone_message((phone, position): &(ReceiverId, Position), time: Timestamp) -> String {
     json!({
         "_type": "location",
-        "topic": format!("owntracks/demonstration/{phone}"),
+        "topic": format!("owntracks/demo/{phone}"),
         "tst": time.as_second(),
         "lon": position.longitude_deg(),
         "lat": position.latitude_deg(),

@@ -5,6 +5,7 @@ mod ais;
 mod device;
 mod places;
 
+use std::collections::BTreeMap;
 use std::io::Write as _;
 use std::net::SocketAddr;
 use std::num::NonZeroU64;
@@ -40,8 +41,8 @@ const SITE: &str = "demo-square";
 const PHONES: &str = "demo-phones";
 const SHIP: &str = "demo-ship";
 
-/// What the ramp has recorded when the demonstration begins: nearly all that it needs to learn.
-const RECORDED: Duration = Duration::from_secs(450);
+/// What the ramp has recorded when the demonstration begins, so that it learns within the next minute.
+const RECORDED: Duration = Duration::from_secs(420);
 
 fn places() -> [Place; 3] {
     [square(), yard(), ramp()]
@@ -65,11 +66,7 @@ pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
 /// Creates the cameras with what they are trained on, the site of the square, and the sources of phones and ship.
 async fn create(app: &App) -> anyhow::Result<()> {
     let site = SiteId::new(SITE)?;
-    app.create_site(NewSite {
-        display_name: "Square (simulated)".to_owned(),
-        ..NewSite::named(site.clone())
-    })
-    .await?;
+    app.create_site(NewSite { display_name: "Square".to_owned(), ..NewSite::named(site.clone()) }).await?;
     for place in places() {
         let is_square = place.identities == Identities::Phones;
         let seen = training_site(&place);
@@ -82,6 +79,7 @@ async fn create(app: &App) -> anyhow::Result<()> {
                 gnss_error: GnssError::Known(SigmaM::new(place.options.gnss_sigma_m)?),
                 location: Some(place.options.origin),
                 recipe: Recipe::Projective,
+                labels: BTreeMap::from([("demonstration".to_owned(), "simulated".to_owned())]),
                 retrain_when_moved: true,
                 site: is_square.then(|| site.clone()),
                 ..NewCamera::named(id.clone())
@@ -94,8 +92,8 @@ async fn create(app: &App) -> anyhow::Result<()> {
         }
     }
     let of_square: Vec<&str> = square().cameras.iter().map(|(id, _)| *id).collect();
-    create_source(app, PHONES, "Phones (simulated)", "phone", &of_square).await?;
-    create_source(app, SHIP, "Ship with AIS (simulated)", "nmea", &of_square).await
+    create_source(app, PHONES, "Phones", "phone", &of_square).await?;
+    create_source(app, SHIP, "Ship with AIS", "nmea", &of_square).await
 }
 
 async fn create_source(

@@ -52,9 +52,9 @@ pub(super) struct Place {
 pub(super) fn square() -> Place {
     Place {
         cameras: &[
-            ("demo", "Square, west (simulated)"),
-            ("demo-middle", "Square, middle (simulated)"),
-            ("demo-east", "Square, east (simulated)"),
+            ("demo", "Square, west"),
+            ("demo-middle", "Square, middle"),
+            ("demo-east", "Square, east"),
         ],
         options: SiteOptions {
             cameras_per_group: 3,
@@ -71,7 +71,7 @@ pub(super) fn square() -> Place {
 /// A camera that is knocked in the middle and at the end of every period: every ten minutes.
 pub(super) fn yard() -> Place {
     Place {
-        cameras: &[("demo-yard", "Yard, knocked every ten minutes (simulated)")],
+        cameras: &[("demo-yard", "Yard, knocked every ten minutes")],
         options: SiteOptions {
             cameras: 1,
             walkers: 6,
@@ -88,7 +88,7 @@ pub(super) fn yard() -> Place {
 /// A camera without a model, which learns from trackers' numbers and two phones.
 pub(super) fn ramp() -> Place {
     Place {
-        cameras: &[("demo-ramp", "Ramp, which learns by itself (simulated)")],
+        cameras: &[("demo-ramp", "Ramp, learns by itself")],
         options: SiteOptions {
             cameras: 1,
             walkers: 6,
@@ -185,7 +185,7 @@ fn item(time: Timestamp) -> LiveItem {
 
 fn tracked_box(detection: &Detection) -> LiveItem {
     LiveItem {
-        tracker_id: TrackerId::new(detection.target_id.as_str()).ok(),
+        tracker_id: TrackerId::new(detection.target_id.as_str().trim_start_matches("track-")).ok(),
         bounding_box: Some(detection.bounding_box),
         class: detection.class.clone(),
         ..item(detection.time)

@@ -50,6 +50,7 @@ pub const OPERATIONS: &[Operation] = &[
     operation(Operate, "DELETE /v1/cameras/{camera}", "sightfix.v1.CameraService/DeleteCamera"),
     operation(Read, "GET /v1/cameras/{camera}/learning", "sightfix.v1.CameraService/GetLearning"),
     operation(Read, "GET /v1/cameras/{camera}/picture", ""),
+    operation(Ingest, "POST /v1/cameras/{camera}/picture", ""),
     operation(Ingest, "PUT /v1/cameras/{camera}/picture", ""),
     operation(Operate, "DELETE /v1/cameras/{camera}/picture", ""),
     operation(Operate, "POST /v1/sites", "sightfix.v1.SiteService/CreateSite"),

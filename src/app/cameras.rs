@@ -1,5 +1,6 @@
 //! Camera profiles.
 
+use super::pictures::check_snapshot;
 use super::{App, Page, page_of};
 use crate::domain::{Camera, CameraChange, CameraId, ExpectedVersion, NewCamera, Result, SiteId};
 
@@ -9,7 +10,9 @@ impl App {
     /// # Errors
     /// `CameraExists`; `InvalidArgument` naming the field.
     pub async fn create_camera(&self, profile: NewCamera) -> Result<Camera> {
-        let camera = self.store.insert_camera(&profile.check()?, self.clock.now()).await?;
+        let profile = profile.check()?;
+        check_snapshot(&profile)?;
+        let camera = self.store.insert_camera(&profile, self.clock.now()).await?;
         self.registry.refresh_camera(&self.store, camera.id()).await?;
         Ok(camera)
     }
@@ -75,6 +78,7 @@ impl App {
         // that two changes at once cannot undo each other.
         let expected = expected.unwrap_or(camera.version());
         let profile = change.apply(camera.profile)?;
+        check_snapshot(&profile)?;
         let camera = self.store.replace_camera(&profile, Some(expected), self.clock.now()).await?;
         self.registry.refresh_camera(&self.store, id).await?;
         Ok(camera)

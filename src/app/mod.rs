@@ -119,6 +119,8 @@ pub struct Parts {
     pub site_training_queue: JobQueue,
     /// Notifies workers of queued evaluations.
     pub evaluation_queue: JobQueue,
+    /// When the snapshot addresses of cameras were asked last.
+    snapshot_times: pictures::SnapshotTimes,
     /// The demonstration, if one is shown.
     pub demonstration: Demonstration,
     /// Which nodes there are, and what this one owns.
@@ -177,6 +179,7 @@ impl App {
             training_queue: JobQueue::default(),
             site_training_queue: JobQueue::default(),
             evaluation_queue: JobQueue::default(),
+            snapshot_times: pictures::SnapshotTimes::default(),
             demonstration: Demonstration::default(),
             cluster: Cluster::default(),
             stream_slots: live::StreamSlots::default(),

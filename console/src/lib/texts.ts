@@ -108,6 +108,7 @@ const table = {
   'problem.shutting-down': ['The server is shutting down:', 'Der Server wird beendet:'],
   'problem.unauthenticated': ['The key does not work:', 'Der Schlüssel gilt nicht:'],
   'problem.permission-denied': ['You may not do this:', 'Das ist nicht erlaubt:'],
+  'problem.snapshot-unavailable': ['The address of the still picture gave none:', 'Die Adresse des Standbildes lieferte keines:'],
   'problem.sign-in-unavailable': ['The sign-in service gives no usable answer:', 'Der Anmeldedienst gibt keine brauchbare Antwort:'],
   'problem.internal': ['The server failed:', 'Im Server ist ein Fehler aufgetreten:'],
 
@@ -570,6 +571,11 @@ const table = {
   'profile.retrain': ['Start a training run when the camera is found to have moved', 'Training starten, wenn die Kamera bewegt wurde'],
   'profile.learn': ['Record and learn by itself while there is no model', 'Ohne Modell von selbst aufzeichnen und lernen'],
   'profile.revision': ['revision {n}', 'Revision {n}'],
+  'profile.snapshot': ['Still picture from the camera', 'Standbild der Kamera'],
+  'profile.snapshot.kept': ['stays as it is', 'bleibt, wie es ist'],
+  'profile.snapshot.password': ['Password', 'Passwort'],
+  'profile.snapshot.url': ['Address (HTTP), which the server asks', 'Adresse (HTTP), die der Server abfragt'],
+  'profile.snapshot.username': ['User name', 'Benutzername'],
   'profile.saved': ['Saved', 'Gespeichert'],
 
   'site.changes': ['What happened', 'Was geschah'],

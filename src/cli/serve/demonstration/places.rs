@@ -76,8 +76,8 @@ pub(super) fn yard() -> Place {
             cameras: 1,
             walkers: 6,
             vehicles: 0,
-            receiver_share: 0.5,
-            pan_deg_from: Some((f64::from(PERIOD_S) / 2.0, 12.0)),
+            receiver_share: 0.67,
+            pan_deg_from: Some((f64::from(PERIOD_S) / 2.0, 20.0)),
             ..options(2, 180.0)
         },
         identities: Identities::Targets,

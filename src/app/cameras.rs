@@ -1,5 +1,6 @@
 //! Camera profiles.
 
+use super::pictures::check_snapshot;
 use super::registry::Registry;
 use super::{App, Page, page_of};
 use crate::clock::Clock;
@@ -28,7 +29,9 @@ impl Cameras<'_> {
     /// # Errors
     /// `CameraExists`; `InvalidArgument` naming the field.
     pub async fn create(&self, profile: NewCamera) -> Result<Camera> {
-        let camera = self.store.insert_camera(&profile.check()?, self.clock.now()).await?;
+        let profile = profile.check()?;
+        check_snapshot(&profile)?;
+        let camera = self.store.insert_camera(&profile, self.clock.now()).await?;
         self.registry.refresh_camera(self.store, camera.id()).await?;
         Ok(camera)
     }
@@ -94,6 +97,7 @@ impl Cameras<'_> {
         // that two changes at once cannot undo each other.
         let expected = expected.unwrap_or(camera.version());
         let profile = change.apply(camera.profile)?;
+        check_snapshot(&profile)?;
         let camera = self.store.replace_camera(&profile, Some(expected), self.clock.now()).await?;
         self.registry.refresh_camera(self.store, id).await?;
         Ok(camera)

@@ -29,6 +29,7 @@ mod publish;
 mod push;
 mod serial;
 mod sink;
+mod snapshot;
 mod source;
 mod stream;
 mod supervisor;
@@ -37,5 +38,6 @@ mod trial;
 mod udp;
 mod webhook;
 
+pub use snapshot::fetch_snapshot;
 pub use supervisor::Supervisor;
 pub use trial::{Trial, try_connection};

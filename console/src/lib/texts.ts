@@ -19,9 +19,30 @@ const table = {
   'action.save': ['Save', 'Speichern'],
   'action.stop': ['Stop', 'Anhalten'],
 
+  'aerial.adjust': ['Drag its corners', 'Ecken verschieben'],
+  'aerial.drop': ['Drop an aerial image', 'Luftbild hier ablegen'],
+  'aerial.formats': [
+    'PNG, JPEG or WebP, also with its world file; or a georeferenced TIFF. Coordinates are degrees or metres of EPSG:3857; an image without a place is put into the middle of the map.',
+    'PNG, JPEG oder WebP, auch mit World-Datei; oder ein georeferenziertes TIFF. Koordinaten sind Grad oder Meter von EPSG:3857; ein Bild ohne Ort kommt in die Mitte der Karte.',
+  ],
+  'aerial.lowerLeft': ['Lower left corner of the image', 'Linke untere Ecke des Bildes'],
+  'aerial.lowerRight': ['Lower right corner of the image', 'Rechte untere Ecke des Bildes'],
+  'aerial.none': ['None of these files is an image.', 'Keine dieser Dateien ist ein Bild.'],
+  'aerial.placed': ['The image is on the map, where its file says.', 'Das Bild liegt auf der Karte, wo seine Datei es angibt.'],
+  'aerial.settle': ['The image lies right', 'Das Bild liegt richtig'],
+  'aerial.text': ['It lies under everything on the maps of this browser, which keeps it; it is not sent to the server.', 'Es liegt auf den Karten dieses Browsers unter allem anderen. Der Browser behält es; es wird nicht zum Server geschickt.'],
+  'aerial.title': ['Aerial image', 'Luftbild'],
+  'aerial.upperLeft': ['Upper left corner of the image', 'Linke obere Ecke des Bildes'],
+  'aerial.upperRight': ['Upper right corner of the image', 'Rechte obere Ecke des Bildes'],
+
   'age.ago': ['{time} ago', 'vor {time}'],
   'age.never': ['never', 'nie'],
   'age.now': ['now', 'jetzt'],
+
+  'demonstration.end': ['End it and remove its cameras', 'Beenden und ihre Kameras entfernen'],
+  'demonstration.ended': ['The demonstration has ended.', 'Die Vorführung ist beendet.'],
+  'demonstration.text': ['Everything here is simulated: people, carts, a ship, cameras and phones.', 'Alles hier ist simuliert: Menschen, Wagen, ein Schiff, Kameras und Telefone.'],
+  'demonstration.title': ['Demonstration', 'Vorführung'],
 
   // What the flags of a position mean, by their name.
   'flag.gnss_denied': ['No fix came with the box: the position is from the box alone.', 'Zur Box kam kein Fix: Die Position stammt nur aus der Box.'],
@@ -87,6 +108,7 @@ const table = {
   'problem.shutting-down': ['The server is shutting down:', 'Der Server wird beendet:'],
   'problem.unauthenticated': ['The key does not work:', 'Der Schlüssel gilt nicht:'],
   'problem.permission-denied': ['You may not do this:', 'Das ist nicht erlaubt:'],
+  'problem.snapshot-unavailable': ['The address of the still picture gave none:', 'Die Adresse des Standbildes lieferte keines:'],
   'problem.sign-in-unavailable': ['The sign-in service gives no usable answer:', 'Der Anmeldedienst gibt keine brauchbare Antwort:'],
   'problem.internal': ['The server failed:', 'Im Server ist ein Fehler aufgetreten:'],
 
@@ -550,6 +572,11 @@ const table = {
   'profile.retrain': ['Start a training run when the camera is found to have moved', 'Training starten, wenn die Kamera bewegt wurde'],
   'profile.learn': ['Record and learn by itself while there is no model', 'Ohne Modell von selbst aufzeichnen und lernen'],
   'profile.revision': ['revision {n}', 'Revision {n}'],
+  'profile.snapshot': ['Still picture from the camera', 'Standbild der Kamera'],
+  'profile.snapshot.kept': ['stays as it is', 'bleibt, wie es ist'],
+  'profile.snapshot.password': ['Password', 'Passwort'],
+  'profile.snapshot.url': ['Address (HTTP), which the server asks', 'Adresse (HTTP), die der Server abfragt'],
+  'profile.snapshot.username': ['User name', 'Benutzername'],
   'profile.saved': ['Saved', 'Gespeichert'],
 
   'site.changes': ['What happened', 'Was geschah'],

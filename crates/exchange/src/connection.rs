@@ -135,7 +135,8 @@ pub struct SourceSettings {
     /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]`, `kafka://HOST[:9092]` and `kafkas://HOST[:9093]` subscribe, Kafka to a
     /// cluster of several hosts with commas between them; `tcp://`,
     /// `tls://` and `gpsd://HOST[:2947]` connect and read lines; `serial:///dev/DEVICE?baud=4800` reads lines of a serial
-    /// device of the server's machine; `udp://ADDRESS:PORT` and `tcp-listen://ADDRESS:PORT` take what is sent there; `push:` takes
+    /// device of the server's machine; `rtsp://HOST[:554]/PATH` and `rtsps://HOST[:322]/PATH` read the ONVIF metadata of a
+    /// camera's stream; `udp://ADDRESS:PORT` and `tcp-listen://ADDRESS:PORT` take what is sent there; `push:` takes
     /// `POST /v1/connections/{connection}/messages`.
     #[schema(max_length = 512, example = "mqtt://broker.example.org:1883")]
     pub address: String,
@@ -429,6 +430,9 @@ impl SourceSettings {
         }
         if address.scheme == Scheme::Gpsd && self.format != MessageFormat::Gpsd {
             return Err(Error::invalid("format", "must be gpsd for an address of gpsd:"));
+        }
+        if address.scheme.is_rtsp() && self.format != MessageFormat::Onvif {
+            return Err(Error::invalid("format", "must be onvif for an address of rtsp: or rtsps:"));
         }
         self.fix_cameras()?;
         self.receiver()?;

@@ -55,6 +55,7 @@ mod track_files;
 mod unix_time;
 pub mod wire;
 mod write;
+mod xml;
 
 pub use address::{Address, Scheme, SerialLine, bracketed};
 pub use connection::{

@@ -116,6 +116,8 @@ pub(super) struct Intake {
     live: Arc<LiveConnection>,
     routing: Routing,
     durability: Option<Durability>,
+    /// True if a message is acknowledged when all that was to be stored of it is stored.
+    awaits_storage: bool,
     decoder: Box<dyn MessageDecoder>,
     streams: HashMap<CameraId, CameraStream>,
     pending: VecDeque<PendingMessage>,
@@ -136,6 +138,7 @@ impl Intake {
             live,
             routing: Routing::of(settings)?,
             durability: settings.store_samples.then_some(Durability::Synced),
+            awaits_storage: settings.store_samples && !settings.answers_at_once(),
             decoder: source_decoder(settings),
             streams: HashMap::new(),
             pending: VecDeque::new(),
@@ -204,7 +207,7 @@ impl Intake {
             match self.follow(&camera, source).await {
                 Ok(seq) => {
                     account.took(&camera, &description, time);
-                    if self.durability.is_some() {
+                    if self.awaits_storage {
                         items.push((camera, seq));
                     }
                 }
@@ -263,6 +266,9 @@ impl Intake {
     /// Samples could not be stored: nothing after them is acknowledged.
     pub(super) fn settled(&mut self) -> Result<Vec<Settled>> {
         let mut settled = Vec::new();
+        for known in self.streams.values() {
+            known.stream.acknowledgement()?;
+        }
         while let Some(message) = self.pending.front() {
             for (camera, seq) in &message.items {
                 if let Some(known) = self.streams.get(camera)

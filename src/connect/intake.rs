@@ -165,7 +165,7 @@ impl Intake {
         let mut items = Vec::new();
         let outcome = match read {
             Ok(Reading { items: read, skipped }) => {
-                account.skip_all(skipped);
+                account.skip_all(skipped, &example_of(&message));
                 for item in read {
                     self.take_item(item, &mut items, &mut account).await?;
                 }
@@ -400,6 +400,12 @@ const EMPTY_READING: &str = "the message contains no detection and no fix";
 /// Bytes of a message that was not taken which are kept as an example.
 const EXAMPLE_BYTES: usize = 200;
 
+/// The beginning of a message, as text.
+fn example_of(message: &Message) -> String {
+    let shown = &message.payload[..message.payload.len().min(EXAMPLE_BYTES)];
+    String::from_utf8_lossy(shown).into_owned()
+}
+
 /// The counts of the items of one message.
 #[derive(Default)]
 struct Account {
@@ -435,11 +441,11 @@ impl Account {
         Ok(())
     }
 
-    fn skip_all(&mut self, reasons: Vec<String>) {
+    fn skip_all(&mut self, reasons: Vec<String>, example: &str) {
         self.skipped += reasons.len() as u64;
         for reason in reasons {
             self.line(format!("skipped: {reason}"));
-            self.reasons.push((reason.clone(), reason));
+            self.reasons.push((reason, example.to_owned()));
         }
     }
 
@@ -448,8 +454,7 @@ impl Account {
         let untaken = outcome.as_ref().err().map(|reason| format!("rejected: {reason}"));
         let untaken = untaken.or_else(|| is_empty.then(|| EMPTY_READING.to_owned()));
         if let Some(reason) = untaken {
-            let shown = &message.payload[..message.payload.len().min(EXAMPLE_BYTES)];
-            self.reasons.push((reason.clone(), String::from_utf8_lossy(shown).into_owned()));
+            self.reasons.push((reason.clone(), example_of(message)));
             self.line(reason);
         }
         let lag = self.latest.map(|latest| self.now.duration_since(latest).as_secs_f64());

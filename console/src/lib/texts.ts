@@ -435,7 +435,6 @@ const table = {
   'training.advice': ['What would help', 'Was helfen würde'],
   'training.chart': ['Errors by epoch', 'Fehler je Epoche'],
   'training.compare': ['Runs compared', 'Läufe im Vergleich'],
-  'training.epoch': ['epoch {epoch} of {epochs}', 'Epoche {epoch} von {epochs}'],
   'training.epochAxis': ['Epoch', 'Epoche'],
   'training.epochs': ['Epochs', 'Epochen'],
   'training.epochs.default': ['the recipe’s own', 'nach Rezept'],

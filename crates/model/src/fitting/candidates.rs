@@ -115,7 +115,8 @@ impl Candidate {
         context.epochs.unwrap_or(default).max(1)
     }
 
-    /// Epochs of one fit, over all of its networks; the final one of `gaussian_process` has one.
+    /// Epochs of one fit, over all of its networks, and what its map counts as; the final one of `gaussian_process` has a
+    /// network.
     pub(super) fn total_epochs(&self, context: &FitContext<'_>, is_final: bool) -> u32 {
         let networks = match self.estimator {
             Estimator::Paper => 2,
@@ -123,7 +124,17 @@ impl Candidate {
             Estimator::Projective(variant) => u32::from(variant.residual),
             Estimator::GaussianProcess => u32::from(is_final),
         };
-        networks.saturating_mul(self.epochs(context))
+        networks.saturating_mul(self.epochs(context)).saturating_add(self.map_epochs())
+    }
+
+    /// Epochs of a network that take as long as the map of a fit, which has none, at some thousand rows: progress counts
+    /// it as these.
+    const fn map_epochs(&self) -> u32 {
+        match self.estimator {
+            Estimator::Paper | Estimator::Hybrid => 0,
+            Estimator::Projective(_) => 20,
+            Estimator::GaussianProcess => 150,
+        }
     }
 
     /// Fits the encoder to rows; its error is not calibrated.
@@ -133,6 +144,7 @@ impl Candidate {
         context: &FitContext<'_>,
         phase: &mut Phase<'_, '_>,
     ) -> Result<FittedEncoder, FitError> {
+        phase.advance(0)?;
         let smoothed = self.smoothed.then(|| rows.smoothed(&context.noise));
         let rows = smoothed.as_ref().unwrap_or(rows);
         let (e_gnss_m2, epochs) = (context.e_gnss_m2, self.epochs(context));
@@ -142,6 +154,7 @@ impl Candidate {
             Estimator::Projective(variant) => projective::fit(rows, variant, e_gnss_m2, epochs, phase),
             Estimator::GaussianProcess => gaussian_process::fit(rows, &context.map_settings(), epochs, phase),
         }?;
+        phase.advance(self.map_epochs())?;
         let coverage = Coverage::new(rows.rows.iter().map(|row| row.bounding_box));
         match self.estimator {
             Estimator::Paper => coverage.put(&mut fitted.parts.tensors),

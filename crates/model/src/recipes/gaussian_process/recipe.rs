@@ -49,6 +49,10 @@ impl Estimator for GaussianProcess {
         u32::from(is_final)
     }
 
+    fn map_epochs(&self) -> u32 {
+        150
+    }
+
     fn fit(
         &self,
         rows: &TrainingRows,

@@ -30,6 +30,7 @@ mod push;
 mod rtsp;
 mod serial;
 mod sink;
+mod snapshot;
 mod source;
 mod stream;
 mod supervisor;
@@ -38,5 +39,6 @@ mod trial;
 mod udp;
 mod webhook;
 
+pub use snapshot::fetch_snapshot;
 pub use supervisor::Supervisor;
 pub use trial::{Trial, try_connection};

@@ -152,6 +152,14 @@ pub fn bracketed(host: &str) -> Cow<'_, str> {
 }
 
 impl Address {
+    /// Reads an address of HTTP or HTTPS.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `address`.
+    pub fn of_http(text: &str) -> Result<Self> {
+        Self::parse(text, &[Scheme::Http, Scheme::Https])
+    }
+
     /// Reads an address of one of these schemes.
     ///
     /// # Errors

@@ -184,7 +184,8 @@ pub struct SourceSettings {
     /// numbers of a tracker, and boxes are matched with receivers by their positions.
     #[serde(default)]
     pub ids_name_targets: bool,
-    /// True if boxes and fixes are paired and stored as samples. Messages are acknowledged when that is done.
+    /// True if boxes and fixes are paired and stored as samples. Messages are acknowledged when that is done, but those
+    /// that phones push (`push:` with the format `phone`) when they were taken.
     #[serde(default)]
     pub store_samples: bool,
 }
@@ -448,6 +449,14 @@ impl SourceSettings {
             checked().map_err(|error: Error| error.under(&format!("cameras.{name}")))?;
         }
         Ok(())
+    }
+
+    /// True if a message is answered when it was taken, before what is to be stored of it is stored: applications of
+    /// phones send a position only after the answer to the one before, and a fix may wait seconds for its box.
+    #[must_use]
+    pub fn answers_at_once(&self) -> bool {
+        let is_pushed = self.address().is_ok_and(|address| address.scheme == Scheme::Push);
+        is_pushed && self.format == MessageFormat::Phone
     }
 
     /// True if its messages contain fixes, not detections.

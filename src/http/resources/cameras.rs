@@ -11,7 +11,9 @@ use utoipa_axum::routes;
 
 use super::receivers::{Receiver, receivers, shown};
 use crate::app::App;
-use crate::domain::{self, CameraId, Error, GnssBiasSigma, NewCamera, Result, SigmaM, SiteId, TargetClass};
+use crate::domain::{
+    self, CameraId, Error, GnssBiasSigma, NewCamera, Recipe, Result, SigmaM, SiteId, TargetClass,
+};
 use crate::exchange::wire::{Position, parse_document};
 use crate::exchange::write_cursor;
 use crate::http::plumbing::access::CallerApp;
@@ -20,7 +22,7 @@ use crate::http::plumbing::extract::{CameraPath, JsonBody, Params, site_of};
 use crate::http::plumbing::merge_patch::{self, JsonObject};
 use crate::http::plumbing::problem::{ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
-use crate::http::plumbing::wire::{Recipe, created, empty, json};
+use crate::http::plumbing::wire::{created, empty, json};
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(create_camera, list_cameras)).routes(routes!(
@@ -79,6 +81,35 @@ impl From<domain::GnssError> for GnssError {
     }
 }
 
+/// Where a still picture of what a camera sees is fetched.
+#[derive(Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub(super) struct SnapshotSource {
+    /// An address of HTTP or HTTPS that answers with a JPEG or PNG, such as ONVIF's snapshot URI or Frigate's
+    /// `/api/<camera>/latest.jpg`.
+    #[schema(max_length = 512, example = "http://frigate.example.org:5000/api/gate/latest.jpg")]
+    url: String,
+    /// The name for HTTP's Basic authentication, where the camera asks for one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(max_length = 256)]
+    username: Option<String>,
+    /// The password. It is never shown; without it, that of the same `url` and `username` is kept.
+    #[serde(skip_serializing)]
+    #[schema(max_length = 256, write_only)]
+    password: Option<String>,
+}
+
+impl SnapshotSource {
+    fn into_domain(self) -> Result<domain::SnapshotSource> {
+        domain::SnapshotSource::new(&self.url, self.username, self.password)
+    }
+
+    fn shown(source: &domain::SnapshotSource) -> Self {
+        let username = source.username().map(str::to_owned);
+        Self { url: source.url().to_owned(), username, password: None }
+    }
+}
+
 /// A camera to be stored. Nothing but the id is needed; no calibration is ever asked for.
 #[derive(Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
@@ -121,6 +152,8 @@ struct CameraDraft {
     /// The site whose world tracks the camera contributes to; it must exist.
     #[schema(example = "harbour")]
     site: Option<String>,
+    /// Where a still picture is fetched, if the camera or another program offers one.
+    snapshot: Option<SnapshotSource>,
 }
 
 impl CameraDraft {
@@ -133,13 +166,14 @@ impl CameraDraft {
             gnss_error: self.gnss_error.map_or(Ok(blank.gnss_error), GnssError::to_domain)?,
             location: location.map_err(|error| error.under("location"))?,
             gnss_bias_sigma: self.gnss_bias_sigma_m.map(GnssBiasSigma::new).transpose()?,
-            recipe: self.recipe.map_or(blank.recipe, domain::Recipe::from),
+            recipe: self.recipe.unwrap_or(blank.recipe),
             target_classes: classes(&self.target_classes)?,
             labels: self.labels,
             receivers: receivers(&self.receivers)?,
             retrain_when_moved: self.retrain_when_moved,
             learn_automatically: self.learn_automatically.unwrap_or(blank.learn_automatically),
             site: self.site.as_deref().map(SiteId::new).transpose().map_err(|error| error.at("site"))?,
+            snapshot: self.snapshot.map(SnapshotSource::into_domain).transpose()?,
             id: blank.id,
         })
     }
@@ -188,6 +222,8 @@ struct CameraChange {
     learn_automatically: Option<bool>,
     /// New site; null removes the camera from its site.
     site: Option<String>,
+    /// New address of a still picture; null forgets it.
+    snapshot: Option<SnapshotSource>,
 }
 
 /// The change that a merge patch makes of a stored camera.
@@ -232,6 +268,9 @@ pub(super) struct Camera {
     /// The site whose world tracks the camera contributes to, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     site: Option<String>,
+    /// Where a still picture is fetched, if stated; without the password.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    snapshot: Option<SnapshotSource>,
     /// Counts the changes of the profile, from 1.
     revision: u64,
     /// When it was made.
@@ -260,8 +299,8 @@ pub(super) struct Camera {
 impl Camera {
     pub(super) fn of(app: &App, camera: domain::Camera) -> Self {
         let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
-        let model_fault = app.model_fault(camera.id()).map(|fault| fault.reason);
-        let warnings = app.camera_warnings(&camera);
+        let model_fault = app.models().fault(camera.id()).map(|fault| fault.reason);
+        let warnings = app.cameras().warnings(&camera);
         let domain::Camera { profile, revision, created_at, updated_at, active_model, samples, key: _ } =
             camera;
         Self {
@@ -273,13 +312,14 @@ impl Camera {
             gnss_error: profile.gnss_error.into(),
             location: profile.location.map(Into::into),
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
-            recipe: profile.recipe.into(),
+            recipe: profile.recipe,
             target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
             labels: profile.labels,
             receivers: shown(&profile.receivers),
             retrain_when_moved: profile.retrain_when_moved,
             learn_automatically: profile.learn_automatically,
             site: profile.site.map(|site| site.as_str().to_owned()),
+            snapshot: profile.snapshot.as_ref().map(SnapshotSource::shown),
             revision: revision.0,
             created_at,
             updated_at,
@@ -299,9 +339,9 @@ impl Camera {
 pub(super) struct CameraMoved {
     /// Number of the model version that no longer fits.
     model_version: u32,
-    /// When it began, as well as it can be estimated.
+    /// Estimated onset of the change.
     #[schema(value_type = String, format = DateTime)]
-    began_at: Timestamp,
+    onset_at: Timestamp,
     /// When the evidence was enough.
     #[schema(value_type = String, format = DateTime)]
     raised_at: Timestamp,
@@ -317,9 +357,9 @@ pub(super) struct CameraMoved {
 
 impl From<&domain::CameraMoved> for CameraMoved {
     fn from(moved: &domain::CameraMoved) -> Self {
-        let &domain::CameraMoved { model_version, began_at, raised_at, .. } = moved;
+        let &domain::CameraMoved { model_version, onset_at, raised_at, .. } = moved;
         let &domain::CameraMoved { shift_east_m, shift_north_m, statistic, targets, .. } = moved;
-        Self { model_version, began_at, raised_at, shift_east_m, shift_north_m, statistic, targets }
+        Self { model_version, onset_at, raised_at, shift_east_m, shift_north_m, statistic, targets }
     }
 }
 
@@ -343,7 +383,7 @@ struct CameraPage {
     )
 )]
 async fn create_camera(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
-    let camera = app.create_camera(body.read::<CameraDraft>()?.into_domain()?).await?;
+    let camera = app.cameras().create(body.read::<CameraDraft>()?.into_domain()?).await?;
     let (location, version) = (format!("/v1/cameras/{}", camera.id()), camera.version());
     Ok(with_etag(created(StatusCode::CREATED, &location, &Camera::of(&app, camera))?, version).await?)
 }
@@ -367,7 +407,7 @@ async fn list_cameras(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let after = params.cursor()?;
     let site = params.take("site", site_of)?;
     params.end()?;
-    let page = app.cameras(site.as_ref(), after.as_ref(), limit).await?;
+    let page = app.cameras().list(site.as_ref(), after.as_ref(), limit).await?;
     Ok(json(&CameraPage {
         items: page.items.into_iter().map(|camera| Camera::of(&app, camera)).collect(),
         next_cursor: page.next.map(|id| write_cursor(&id)),
@@ -387,7 +427,7 @@ async fn list_cameras(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     )
 )]
 async fn get_camera(CallerApp(app): CallerApp, CameraPath(id): CameraPath, headers: HeaderMap) -> ApiResult {
-    let camera = app.camera(&id).await?;
+    let camera = app.cameras().get(&id).await?;
     let version = camera.version();
     let response = with_etag(json(&Camera::of(&app, camera))?, version).await?;
     Ok(unless_known(&headers, response))
@@ -420,9 +460,9 @@ async fn change_camera(
     let expected = etag::required(&headers)?;
     let patch = body.read::<JsonObject>()?;
     let change = || async {
-        let camera = app.camera(&id).await?;
+        let camera = app.cameras().get(&id).await?;
         let version = expected.unwrap_or(camera.version());
-        app.change_camera(&id, patched(&app, camera, &patch)?, Some(version)).await
+        app.cameras().change(&id, patched(&app, camera, &patch)?, Some(version)).await
     };
     let changed = merge_patch::retried(expected.is_some(), change).await?;
     let version = changed.version();
@@ -447,6 +487,6 @@ async fn delete_camera(
     CameraPath(id): CameraPath,
     headers: HeaderMap,
 ) -> ApiResult {
-    app.delete_camera(&id, etag::optional(&headers)?).await?;
+    app.cameras().delete(&id, etag::optional(&headers)?).await?;
     Ok(empty())
 }

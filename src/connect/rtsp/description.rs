@@ -93,7 +93,7 @@ mod tests {
         let video = ["m=video 0 RTP/AVP 96", "a=control:track1", "a=rtpmap:96 H264/90000"];
         let absolute = "rtsp://192.168.5.106:554/Streaming/Channels/101/trackID=3?transportmode=unicast";
         let control = format!("a=control:{absolute}");
-        let hikvision = [&["v=0", "t=0 0", "a=control:*"], &video[..]].concat();
+        let hikvision = [&["v=0", "t=0 0", "a=control:*"][..], &video].concat();
         let hikvision = [
             &hikvision[..],
             &["m=application 0 RTP/AVP 107", &control, "a=rtpmap:107 vnd.onvif.metadata/90000"],

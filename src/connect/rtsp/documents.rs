@@ -88,7 +88,7 @@ mod tests {
     fn packet(sequence: u16, is_last: bool, payload: &str) -> Vec<u8> {
         let [high, low] = sequence.to_be_bytes();
         let header = [0x80, if is_last { 0x80 | 107 } else { 107 }, high, low, 0, 0, 0, 0, 0, 0, 0, 1];
-        [&header, payload.as_bytes()].concat()
+        [&header[..], payload.as_bytes()].concat()
     }
 
     fn complete(content: &'static str) -> Option<Document> {

@@ -259,7 +259,7 @@ fn every_format_of_fixes_gives_the_same_samples() {
 #[test]
 fn an_estimated_offset_is_printed_and_applied_only_on_request() {
     let recording = Recording::simulated("1", "3000");
-    let fixes = recording.write("fixes.gpx", &gpx(&recording.anonymous_fixes(4.0)));
+    let fixes = recording.write("fixes.gpx", gpx(&recording.anonymous_fixes(4.0)));
     let offset_s = |printed: &str| -> f64 {
         let line = printed.lines().find(|line| line.starts_with("clock offset of")).expect("an estimate");
         let seconds = line.split(": ").nth(1).and_then(|rest| rest.split(" s").next()).expect("a number");

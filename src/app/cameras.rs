@@ -1,5 +1,6 @@
 //! Camera profiles.
 
+use super::access::Caller;
 use super::registry::Registry;
 use super::{App, Page, page_of};
 use crate::clock::Clock;
@@ -9,16 +10,17 @@ use crate::store::Store;
 /// The use cases of cameras and their profiles.
 #[derive(Clone, Copy)]
 pub struct Cameras<'a> {
-    store: &'a Store,
-    registry: &'a Registry,
-    clock: &'a Clock,
+    pub(super) store: &'a Store,
+    pub(super) registry: &'a Registry,
+    pub(super) clock: &'a Clock,
+    pub(super) caller: &'a Caller,
 }
 
 impl App {
     /// The use cases of cameras and their profiles.
     #[must_use]
     pub fn cameras(&self) -> Cameras<'_> {
-        Cameras { store: &self.store, registry: &self.registry, clock: &self.clock }
+        Cameras { store: &self.store, registry: &self.registry, clock: &self.clock, caller: &self.caller }
     }
 }
 

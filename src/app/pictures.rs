@@ -1,9 +1,9 @@
 //! Pictures of what cameras see.
 
-use super::App;
+use super::cameras::Cameras;
 use crate::domain::{CameraId, Picture, Result};
 
-impl App {
+impl Cameras<'_> {
     /// The picture of what a camera sees; `None` if nobody has set one.
     ///
     /// # Errors
@@ -17,7 +17,7 @@ impl App {
     /// # Errors
     /// `CameraNotFound`; `PermissionDenied` for a device of other cameras; `InsufficientStorage`.
     pub async fn set_picture(&self, id: &CameraId, picture: Option<&Picture>) -> Result<()> {
-        self.active_camera(id).await?;
+        self.registry.active_camera(self.store, self.caller, id).await?;
         self.store.set_picture(id, picture, self.clock.now()).await
     }
 }

@@ -37,7 +37,7 @@ struct PictureFile(Vec<u8>);
     )
 )]
 async fn get_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
-    let Some(picture) = app.picture(&id).await? else { return Ok(empty()) };
+    let Some(picture) = app.cameras().picture(&id).await? else { return Ok(empty()) };
     let content_type = HeaderValue::from_static(picture.format().media_type());
     let mut response = Response::new(Body::from(picture.into_content()));
     response.headers_mut().insert(CONTENT_TYPE, content_type);
@@ -64,7 +64,7 @@ async fn set_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath, requ
     let format = readable.into_iter().find(|format| given == Some(format.media_type()));
     let format = format.ok_or_else(|| not_read(&readable.map(PictureFormat::media_type)))?;
     let content = body::whole(&parts.headers, content, app.limits.picture_bytes).await?;
-    app.set_picture(&id, Some(&Picture::new(format, content.into())?)).await?;
+    app.cameras().set_picture(&id, Some(&Picture::new(format, content.into())?)).await?;
     Ok(empty())
 }
 
@@ -75,6 +75,6 @@ async fn set_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath, requ
     responses((status = 204, description = "There is none now"))
 )]
 async fn delete_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
-    app.set_picture(&id, None).await?;
+    app.cameras().set_picture(&id, None).await?;
     Ok(empty())
 }

@@ -98,6 +98,7 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::ShuttingDown => (503, code::UNAVAILABLE, "The server is shutting down"),
         Kind::Unauthenticated => (401, code::UNAUTHENTICATED, "The request needs a key that works"),
         Kind::PermissionDenied => (403, code::PERMISSION_DENIED, "The key may not do this"),
+        Kind::SnapshotUnavailable => (502, code::UNAVAILABLE, "The snapshot address gave no picture"),
         Kind::SignInUnavailable => (502, code::UNAVAILABLE, "The OpenID provider gave no usable answer"),
         Kind::HostNotAllowed => (421, code::PERMISSION_DENIED, "The server does not answer for this host"),
         Kind::OriginNotAllowed => {

@@ -11,6 +11,8 @@ interface Fixtures {
   disk: string;
   /** Where the server listens; a free port if it is not named. */
   listen: string;
+  /** Further flags of `sightfix serve`. */
+  flags: string[];
   server: Server;
   /** Console errors that the test provokes on purpose. */
   allowed: RegExp;
@@ -22,8 +24,9 @@ export const test = base.extend<Fixtures>({
   allowed: [/^$/, { option: true }],
   disk: ['', { option: true }],
   listen: ['127.0.0.1:0', { option: true }],
-  server: async ({ settings, disk, listen }, use) => {
-    const server = await Server.start(settings, disk, listen);
+  flags: [[], { option: true }],
+  server: async ({ settings, disk, listen, flags }, use) => {
+    const server = await Server.start(settings, disk, listen, flags);
     await use(server);
     await server.stop();
   },

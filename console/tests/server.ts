@@ -10,18 +10,20 @@ export const BINARY = resolve(process.env.SIGHTFIX ?? '../target/debug/sightfix'
 export class Server {
   readonly #folder = mkdtempSync(join(tmpdir(), 'sightfix-console-'));
   readonly #settings: Record<string, string>;
+  readonly #flags: string[];
   /** Whether the data folder is a disk of its own. */
   #hasDisk = false;
   #process: ChildProcess | undefined;
   url = '';
 
-  private constructor(settings: Record<string, string>) {
+  private constructor(settings: Record<string, string>, flags: string[]) {
     this.#settings = settings;
+    this.#flags = flags;
   }
 
   /** `disk` is the size of a disk of its own for the data folder, such as `24m`; mounting it needs the superuser. */
-  static async start(settings: Record<string, string> = {}, disk = '', listen = '127.0.0.1:0'): Promise<Server> {
-    const server = new Server(settings);
+  static async start(settings: Record<string, string> = {}, disk = '', listen = '127.0.0.1:0', flags: string[] = []): Promise<Server> {
+    const server = new Server(settings, flags);
     if (disk) {
       execFileSync('mount', ['-t', 'tmpfs', '-o', `size=${disk}`, 'tmpfs', server.#folder]);
       server.#hasDisk = true;
@@ -34,7 +36,7 @@ export class Server {
   async run(listen: string): Promise<void> {
     // Settings of whoever runs the tests are not the test's.
     const inherited = Object.fromEntries(Object.entries(process.env).filter(([name]) => !name.startsWith('SIGHTFIX_')));
-    const child = spawn(BINARY, ['serve', '--data', this.#folder, '--listen', listen], {
+    const child = spawn(BINARY, ['serve', '--data', this.#folder, '--listen', listen, ...this.#flags], {
       env: { ...inherited, SIGHTFIX_LOG_FORMAT: 'json', ...this.#settings },
       stdio: ['ignore', 'ignore', 'pipe'],
       cwd: tmpdir(),

@@ -1,6 +1,6 @@
 //! Camera profiles.
 
-use super::access::Caller;
+use super::pictures::check_snapshot;
 use super::registry::Registry;
 use super::{App, Page, page_of};
 use crate::clock::Clock;
@@ -10,17 +10,16 @@ use crate::store::Store;
 /// The use cases of cameras and their profiles.
 #[derive(Clone, Copy)]
 pub struct Cameras<'a> {
-    pub(super) store: &'a Store,
-    pub(super) registry: &'a Registry,
-    pub(super) clock: &'a Clock,
-    pub(super) caller: &'a Caller,
+    store: &'a Store,
+    registry: &'a Registry,
+    clock: &'a Clock,
 }
 
 impl App {
     /// The use cases of cameras and their profiles.
     #[must_use]
     pub fn cameras(&self) -> Cameras<'_> {
-        Cameras { store: &self.store, registry: &self.registry, clock: &self.clock, caller: &self.caller }
+        Cameras { store: &self.store, registry: &self.registry, clock: &self.clock }
     }
 }
 
@@ -30,7 +29,9 @@ impl Cameras<'_> {
     /// # Errors
     /// `CameraExists`; `InvalidArgument` naming the field.
     pub async fn create(&self, profile: NewCamera) -> Result<Camera> {
-        let camera = self.store.insert_camera(&profile.check()?, self.clock.now()).await?;
+        let profile = profile.check()?;
+        check_snapshot(&profile)?;
+        let camera = self.store.insert_camera(&profile, self.clock.now()).await?;
         self.registry.refresh_camera(self.store, camera.id()).await?;
         Ok(camera)
     }
@@ -96,6 +97,7 @@ impl Cameras<'_> {
         // that two changes at once cannot undo each other.
         let expected = expected.unwrap_or(camera.version());
         let profile = change.apply(camera.profile)?;
+        check_snapshot(&profile)?;
         let camera = self.store.replace_camera(&profile, Some(expected), self.clock.now()).await?;
         self.registry.refresh_camera(self.store, id).await?;
         Ok(camera)

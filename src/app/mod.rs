@@ -11,6 +11,7 @@ mod camera_statuses;
 mod cameras;
 mod cluster;
 mod connections;
+mod demonstration;
 mod evaluations;
 mod fusion;
 mod idempotency;
@@ -55,6 +56,7 @@ pub use connections::{
     ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, CountedReason,
     LastMessage, LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
 };
+pub use demonstration::{Demonstration, DemonstrationParts};
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest, Evaluations};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
 pub use keys::Keys;
@@ -120,6 +122,10 @@ pub struct Parts {
     pub training_queues: TrainingQueues,
     /// Notifies workers of queued evaluations.
     pub evaluation_queue: JobQueue,
+    /// When the snapshot addresses of cameras were asked last.
+    snapshot_times: pictures::SnapshotTimes,
+    /// The demonstration, if one is shown.
+    pub demonstration: Demonstration,
     /// Which nodes there are, and what this one owns.
     cluster: Cluster,
     /// Open live streams.
@@ -175,6 +181,8 @@ impl App {
             pairings,
             training_queues: TrainingQueues::default(),
             evaluation_queue: JobQueue::default(),
+            snapshot_times: pictures::SnapshotTimes::default(),
+            demonstration: Demonstration::default(),
             cluster: Cluster::default(),
             stream_slots: live::StreamSlots::default(),
             matching_slot: live::MatchingSlot::default(),

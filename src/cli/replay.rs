@@ -148,6 +148,7 @@ impl Replay {
             cameras: self.destination.cameras as usize,
             client_name: self.destination.client_name.clone(),
             pace: self.pacing.rate.unwrap_or(self.pacing.speed),
+            head_start: Duration::ZERO,
             repetitions: self.pacing.repeat,
             duration: self.pacing.duration_s.map(Duration::from_secs),
             shift,

@@ -27,8 +27,10 @@ mod open;
 mod peer;
 mod publish;
 mod push;
+mod rtsp;
 mod serial;
 mod sink;
+mod snapshot;
 mod source;
 mod stream;
 mod supervisor;
@@ -37,5 +39,6 @@ mod trial;
 mod udp;
 mod webhook;
 
+pub use snapshot::fetch_snapshot;
 pub use supervisor::Supervisor;
 pub use trial::{Trial, try_connection};

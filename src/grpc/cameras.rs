@@ -9,7 +9,7 @@ use super::statuses::{Reply, answer};
 use crate::app::{App, Learning, LearningState};
 use crate::domain::{
     Camera, CameraChange, CameraId, ClockOffset, Error, GnssBiasSigma, GnssError, ImageSize, NewCamera,
-    Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, SiteId, TargetClass, TargetId,
+    Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, SiteId, SnapshotSource, TargetClass, TargetId,
 };
 
 pub(super) struct Cameras {
@@ -130,6 +130,10 @@ fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> 
         retrain_when_moved: profile.retrain_when_moved.unwrap_or(named.retrain_when_moved),
         learn_automatically: profile.learn_automatically.unwrap_or(named.learn_automatically),
         site: profile.site.as_deref().map(SiteId::new).transpose().map_err(|error| error.at("site"))?,
+        snapshot: profile
+            .snapshot
+            .map(|it| SnapshotSource::new(&it.url, it.username, it.password))
+            .transpose()?,
         id: named.id,
     })
 }
@@ -202,6 +206,7 @@ fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
         ("retrain_when_moved", profile.retrain_when_moved.is_some()),
         ("learn_automatically", profile.learn_automatically.is_some()),
         ("site", profile.site.is_some()),
+        ("snapshot", profile.snapshot.is_some()),
     ];
     has.into_iter().filter_map(|(field, has)| has.then_some(field)).collect()
 }
@@ -245,6 +250,11 @@ impl From<NewCamera> for proto::CameraProfile {
             location: profile.location.map(Into::into),
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
             site: profile.site.map(|site| site.as_str().to_owned()),
+            snapshot: profile.snapshot.map(|source| proto::SnapshotSource {
+                url: source.url().to_owned(),
+                username: source.username().map(str::to_owned),
+                password: None,
+            }),
         }
     }
 }

@@ -102,7 +102,8 @@ fn simulated_camera(
         _ => options.pace.initial_delay(&recording, &mut random(1)),
     };
     let until = options.duration.map(|duration| started + duration);
-    let feed = PacedFeed::new(recording, items, options.pace, started + delay, until);
+    let begin = (started + delay).checked_sub(options.head_start).unwrap_or(started);
+    let feed = PacedFeed::new(recording, items, options.pace, begin, until);
     let buffer = ResendBuffer::new(options.resend_buffer, options.store_samples);
     SimulatedCamera::new(
         number,

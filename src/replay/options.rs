@@ -25,6 +25,8 @@ pub struct ReplayOptions {
     pub client_name: String,
     /// When items are sent.
     pub pace: Pace,
+    /// Items that are due within this time from the beginning are sent at once.
+    pub head_start: Duration,
     /// Repetitions of the recording, each shifted in time after the one before.
     pub repetitions: NonZeroU64,
     /// No item is sent after this time; `repetitions` is then ignored.

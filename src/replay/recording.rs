@@ -82,6 +82,27 @@ impl RecordedStream {
         Ok(Self { items, first, last, interval })
     }
 
+    /// Rows in the order of time that are repeated with a period, which begins at `first`, may contain nothing at its
+    /// beginning and end, and is a multiple of the interval between instants.
+    ///
+    /// # Errors
+    /// Refuses an empty recording.
+    pub fn periodic(
+        rows: Vec<LiveItem>,
+        first: Timestamp,
+        period: SignedDuration,
+        interval: SignedDuration,
+    ) -> Result<Self> {
+        let last = first.saturating_add(period - interval).unwrap_or(first);
+        Ok(Self { first, last, interval, ..Self::from_items(rows)? })
+    }
+
+    /// The first instant of the first repetition.
+    #[must_use]
+    pub const fn first(&self) -> Timestamp {
+        self.first
+    }
+
     /// Number of items.
     #[must_use]
     pub const fn len(&self) -> usize {

@@ -98,6 +98,11 @@ export async function putFile(path: string, file: Blob): Promise<void> {
   await send('PUT', path, { body: file, headers: { 'content-type': file.type } });
 }
 
+/** Has the server make a file. */
+export async function fetchFile(path: string): Promise<Blob> {
+  return (await send('POST', path, { accept: '*/*' })).blob();
+}
+
 /** A file; undefined where there is none (204). */
 export async function blob(path: string): Promise<Blob | undefined> {
   const response = await send('GET', path, { accept: '*/*' });

@@ -1,5 +1,5 @@
 // What the server says of itself; read once.
-import { get } from './api';
+import { del, get } from './api';
 import type { ServerInfo } from './types';
 
 class Server {
@@ -17,6 +17,12 @@ class Server {
       },
     );
     return this.#loading;
+  }
+
+  /** Stops the simulated devices and removes their cameras. */
+  async endDemonstration(): Promise<void> {
+    await del('/v1/demonstration');
+    if (this.info) this.info = { ...this.info, demonstration: false };
   }
 }
 

@@ -1,5 +1,5 @@
 // Pictures of what cameras see, which the server keeps: boxes are drawn on them.
-import { blob, cameraPath, del, putFile } from './api';
+import { blob, cameraPath, del, fetchFile, putFile } from './api';
 
 /** Longer side of a picture that is sent: enough to see who stands where. */
 const LONGEST_SIDE_PX = 1920;
@@ -11,6 +11,11 @@ class Stills {
   async load(camera: string): Promise<void> {
     const picture = await blob(cameraPath(camera, 'picture'));
     if (picture) this.#show(camera, await createImageBitmap(picture));
+  }
+
+  /** Has the server fetch a new picture from the camera's snapshot address. */
+  async fetch(camera: string): Promise<void> {
+    this.#show(camera, await createImageBitmap(await fetchFile(cameraPath(camera, 'picture'))));
   }
 
   /** Sends any image that the browser can read, as a JPEG within the server's limit. */

@@ -41,6 +41,11 @@ export interface CameraMoved {
   statistic: number;
   targets: number;
 }
+/** Where a still picture is fetched; the password is never shown. */
+export interface SnapshotSource {
+  url: string;
+  username?: string;
+}
 export interface Camera {
   id: string;
   display_name: string;
@@ -52,6 +57,7 @@ export interface Camera {
   receivers: Receiver[];
   /** Whose world tracks the camera contributes to. */
   site?: string;
+  snapshot?: SnapshotSource;
   retrain_when_moved: boolean;
   learn_automatically: boolean;
   revision: number;
@@ -315,6 +321,8 @@ export interface EvaluationReport {
 export interface ServerInfo {
   version: string;
   limits: Record<string, number>;
+  /** Whether what the server answers is simulated. */
+  demonstration: boolean;
   tiles?: Tiles;
   /** Tiles of another server, which is asked once the user agrees. */
   offered_tiles?: Tiles;

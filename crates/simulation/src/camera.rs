@@ -47,6 +47,23 @@ impl PinholeCamera {
         Some([0.5 * width_px + factor * column, 0.5 * height_px + factor * row])
     }
 
+    /// The point of the ground that is seen in a column and row, px, without the lens's distortion; `None` above the
+    /// horizon.
+    pub(super) fn ground_at(&self, column_px: f64, row_px: f64) -> Option<EastNorth> {
+        let (sin_pan, cos_pan) = self.pan_deg.to_radians().sin_cos();
+        let (sin_tilt, cos_tilt) = self.tilt_deg.to_radians().sin_cos();
+        let (width_px, height_px) = self.size_px();
+        let right = (column_px - 0.5 * width_px) / self.focal_px;
+        let below = (row_px - 0.5 * height_px) / self.focal_px;
+        let (ahead, down) = (cos_tilt - below * sin_tilt, sin_tilt + below * cos_tilt);
+        let distance = (down > 0.0).then(|| self.height_m / down)?;
+        let (ahead_m, right_m) = (distance * ahead, distance * right);
+        Some(EastNorth {
+            east_m: sin_pan * ahead_m + cos_pan * right_m,
+            north_m: cos_pan * ahead_m - sin_pan * right_m,
+        })
+    }
+
     /// Factor `1 + k r^2` on the distance from the centre, with r in half diagonals. Beyond the radius
     /// where strong barrel distortion would fold points back into the image it stays constant.
     fn distortion(&self, radius: f64) -> f64 {
@@ -103,6 +120,15 @@ mod tests {
         let [right, _] = camera(0.0).project(at(10.0, -1.0, 0.0)).expect("in front");
         assert!((right - 640.0 - 1000.0 / (10.0 * 2.0f64.sqrt())).abs() < 1e-9, "{right}");
         assert!(camera(0.0).project(at(-30.0, 0.0, 0.0)).is_none());
+    }
+
+    #[test]
+    fn a_pixel_shows_the_ground_that_is_projected_there() {
+        let camera = camera(0.0);
+        let [column, row] = camera.project(at(14.0, -3.0, 0.0)).expect("in front");
+        let ground = camera.ground_at(column, row).expect("below the horizon");
+        assert!(ground.distance_m(EastNorth { east_m: 14.0, north_m: -3.0 }) < 1e-9, "{ground:?}");
+        assert!(camera.ground_at(640.0, -700.0).is_none());
     }
 
     #[test]

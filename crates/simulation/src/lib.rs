@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`simulate`], [`simulate_split`] | one camera and its targets, a [`World`] of a [`Scene`] |
 //! | [`simulate_site`] | the cameras of a site, their trackers and the receivers of all targets |
+//! | [`site_stills`] | what these cameras see while nobody is in view |
 //! | [`SimulatedReceiver`] | the error of one GNSS receiver along a path |
 //! | [`stream`], [`standard_normal`] | an independent random stream of a seed, and a draw from it |
 //!
@@ -42,7 +43,9 @@ pub use positions::{SimulatedPositions, SiteVisits, VISIT_GNSS_SIGMA_M, VISIT_MO
 pub use row::SimulatedRow;
 pub use scene::Scene;
 pub use shape::TargetShape;
-pub use site::{LabelledDetection, SimulatedCamera, SimulatedSite, SiteOptions, simulate_site};
+pub use site::{
+    LabelledDetection, SimulatedCamera, SimulatedSite, SiteOptions, Still, simulate_site, site_stills,
+};
 pub use world::{World, simulate, simulate_split};
 
 use sightfix_domain::{domain, geo};

@@ -1,6 +1,6 @@
 //! `sightfix serve`
 
-mod demo;
+mod demonstration;
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -26,7 +26,7 @@ pub(super) struct Serve {
     /// [env: SIGHTFIX_ADVERTISED_URL]
     #[arg(long, value_name = "URL")]
     advertise: Option<String>,
-    /// Fill an empty data folder with a small simulated camera, train it, and print requests to try
+    /// Fill an empty data folder with a simulated harbour, train its cameras, and print requests to try
     #[arg(long)]
     demo: bool,
     /// Serve everybody on an address that other machines reach, while no key exists [env: SIGHTFIX_INSECURE]
@@ -78,12 +78,12 @@ impl Serve {
             }
             let has_tls = server.has_tls();
             let serving = tokio::spawn(server.run());
-            let shown = if self.demo { demo::show(&app, address).await } else { Ok(()) };
+            let shown = if self.demo { demonstration::show(&app, address).await } else { Ok(()) };
             if shown.is_err() {
                 shutdown.drain();
             } else if self.demo && !has_tls && app.access.is_open() {
                 tokio::spawn(async move {
-                    if let Err(error) = demo::walk(address, Clock::system().now()).await {
+                    if let Err(error) = demonstration::run(&app, address, Clock::system().now()).await {
                         tracing::error!(%error, "the targets of the demonstration do not move");
                     }
                 });

@@ -81,6 +81,35 @@ impl From<domain::GnssError> for GnssError {
     }
 }
 
+/// Where a still picture of what a camera sees is fetched.
+#[derive(Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub(super) struct SnapshotSource {
+    /// An address of HTTP or HTTPS that answers with a JPEG or PNG, such as ONVIF's snapshot URI or Frigate's
+    /// `/api/<camera>/latest.jpg`.
+    #[schema(max_length = 512, example = "http://frigate.example.org:5000/api/gate/latest.jpg")]
+    url: String,
+    /// The name for HTTP's Basic authentication, where the camera asks for one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(max_length = 256)]
+    username: Option<String>,
+    /// The password. It is never shown; without it, that of the same `url` and `username` is kept.
+    #[serde(skip_serializing)]
+    #[schema(max_length = 256, write_only)]
+    password: Option<String>,
+}
+
+impl SnapshotSource {
+    fn into_domain(self) -> Result<domain::SnapshotSource> {
+        domain::SnapshotSource::new(&self.url, self.username, self.password)
+    }
+
+    fn shown(source: &domain::SnapshotSource) -> Self {
+        let username = source.username().map(str::to_owned);
+        Self { url: source.url().to_owned(), username, password: None }
+    }
+}
+
 /// A camera to be stored. Nothing but the id is needed; no calibration is ever asked for.
 #[derive(Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
@@ -123,6 +152,8 @@ struct CameraDraft {
     /// The site whose world tracks the camera contributes to; it must exist.
     #[schema(example = "harbour")]
     site: Option<String>,
+    /// Where a still picture is fetched, if the camera or another program offers one.
+    snapshot: Option<SnapshotSource>,
 }
 
 impl CameraDraft {
@@ -142,6 +173,7 @@ impl CameraDraft {
             retrain_when_moved: self.retrain_when_moved,
             learn_automatically: self.learn_automatically.unwrap_or(blank.learn_automatically),
             site: self.site.as_deref().map(SiteId::new).transpose().map_err(|error| error.at("site"))?,
+            snapshot: self.snapshot.map(SnapshotSource::into_domain).transpose()?,
             id: blank.id,
         })
     }
@@ -190,6 +222,8 @@ struct CameraChange {
     learn_automatically: Option<bool>,
     /// New site; null removes the camera from its site.
     site: Option<String>,
+    /// New address of a still picture; null forgets it.
+    snapshot: Option<SnapshotSource>,
 }
 
 /// The change that a merge patch makes of a stored camera.
@@ -234,6 +268,9 @@ pub(super) struct Camera {
     /// The site whose world tracks the camera contributes to, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     site: Option<String>,
+    /// Where a still picture is fetched, if stated; without the password.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    snapshot: Option<SnapshotSource>,
     /// Counts the changes of the profile, from 1.
     revision: u64,
     /// When it was made.
@@ -282,6 +319,7 @@ impl Camera {
             retrain_when_moved: profile.retrain_when_moved,
             learn_automatically: profile.learn_automatically,
             site: profile.site.map(|site| site.as_str().to_owned()),
+            snapshot: profile.snapshot.as_ref().map(SnapshotSource::shown),
             revision: revision.0,
             created_at,
             updated_at,

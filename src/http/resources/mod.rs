@@ -6,6 +6,7 @@ mod camera_statuses;
 mod cameras;
 mod connections;
 mod console;
+mod demonstration;
 mod evaluations;
 mod features;
 mod fusions;
@@ -68,6 +69,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .merge(openid::routes())
         .merge(nodes::routes())
         .merge(server_info::routes())
+        .merge(demonstration::routes())
         .merge(tiles::routes())
         .merge(service::routes())
 }

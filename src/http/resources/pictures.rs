@@ -9,6 +9,7 @@ use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use crate::connect::fetch_snapshot;
 use crate::domain::{Picture, PictureFormat};
 use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::body;
@@ -18,7 +19,7 @@ use crate::http::plumbing::state::Rest;
 use crate::http::plumbing::wire::empty;
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
-    OpenApiRouter::new().routes(routes!(get_picture, set_picture, delete_picture))
+    OpenApiRouter::new().routes(routes!(get_picture, fetch_picture, set_picture, delete_picture))
 }
 
 /// A picture's file, as bytes.
@@ -37,12 +38,31 @@ struct PictureFile(Vec<u8>);
     )
 )]
 async fn get_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
-    let Some(picture) = app.cameras().picture(&id).await? else { return Ok(empty()) };
+    Ok(app.picture(&id).await?.map_or_else(empty, shown))
+}
+
+/// Fetch a new picture of what a camera sees
+///
+/// From the address `snapshot` of its profile. The picture is stored, and is the answer.
+#[utoipa::path(
+    post, path = "/v1/cameras/{camera}/picture", tag = "cameras",
+    params(("camera" = String, Path, description = "The camera's id")),
+    responses(
+        (status = 200, description = "The picture", content((PictureFile = "image/jpeg"), (PictureFile = "image/png"))),
+        (status = 502, description = "The address gave no picture", body = Problem, content_type = "application/problem+json"),
+        (status = 507, description = "There is no space for it", body = Problem, content_type = "application/problem+json"),
+    )
+)]
+async fn fetch_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
+    Ok(shown(fetch_snapshot(&app, &id).await?))
+}
+
+fn shown(picture: Picture) -> Response {
     let content_type = HeaderValue::from_static(picture.format().media_type());
     let mut response = Response::new(Body::from(picture.into_content()));
     response.headers_mut().insert(CONTENT_TYPE, content_type);
     response.headers_mut().insert(CACHE_CONTROL, HeaderValue::from_static("no-store"));
-    Ok(response)
+    response
 }
 
 /// Set the picture of what a camera sees
@@ -64,7 +84,7 @@ async fn set_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath, requ
     let format = readable.into_iter().find(|format| given == Some(format.media_type()));
     let format = format.ok_or_else(|| not_read(&readable.map(PictureFormat::media_type)))?;
     let content = body::whole(&parts.headers, content, app.limits.picture_bytes).await?;
-    app.cameras().set_picture(&id, Some(&Picture::new(format, content.into())?)).await?;
+    app.set_picture(&id, Some(&Picture::new(format, content.into())?)).await?;
     Ok(empty())
 }
 
@@ -75,6 +95,6 @@ async fn set_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath, requ
     responses((status = 204, description = "There is none now"))
 )]
 async fn delete_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
-    app.cameras().set_picture(&id, None).await?;
+    app.set_picture(&id, None).await?;
     Ok(empty())
 }

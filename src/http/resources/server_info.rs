@@ -29,6 +29,8 @@ struct Server {
     /// The limits in force, by the name of the setting below `limits`.
     #[schema(value_type = BTreeMap<String, f64>)]
     limits: BTreeMap<String, Value>,
+    /// True while the server shows its demonstration: what it answers is simulated.
+    demonstration: bool,
     /// Map tiles that the operator's console may show, if they are set.
     #[serde(skip_serializing_if = "Option::is_none")]
     tiles: Option<Tiles>,
@@ -74,7 +76,8 @@ async fn get_server(State(rest): State<Rest>) -> ApiResult {
         attribution: attribution.to_owned(),
     });
     let (version, tiles) = (env!("CARGO_PKG_VERSION"), tiles_of(&rest.console));
-    Ok(json(&Server { version, limits, tiles, offered_tiles })?)
+    let demonstration = rest.app.demonstration.is_shown();
+    Ok(json(&Server { version, limits, demonstration, tiles, offered_tiles })?)
 }
 
 fn tiles_of(settings: &Console) -> Option<Tiles> {

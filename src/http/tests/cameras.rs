@@ -219,6 +219,71 @@ async fn a_receivers_error_is_told_from_fixes_at_one_point() {
     assert_eq!(nmea.problem(422, "invalid-argument"), ["fixes"]);
 }
 
+/// Answers one request with a file, after checking that it has the header; its address.
+async fn one_answer(expected: &'static str, file: Vec<u8>) -> String {
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    tokio::spawn(async move {
+        let (mut stream, _) = listener.accept().await.expect("a client");
+        let mut request = vec![0; 4_096];
+        let length = stream.read(&mut request).await.expect("a request");
+        let request = String::from_utf8_lossy(&request[..length]).into_owned();
+        let status = if request.contains(expected) { "200 OK" } else { "401 Unauthorized" };
+        let head = format!("HTTP/1.1 {status}\r\ncontent-length: {}\r\n\r\n", file.len());
+        stream.write_all(&[head.as_bytes(), &file].concat()).await.expect("an answer");
+    });
+    format!("http://{address}/still.jpg?size=full")
+}
+
+#[tokio::test]
+async fn a_picture_is_fetched_with_a_password_that_nobody_sees() {
+    let rest = Rest::with_camera().await;
+    let (path, profile) = ("/v1/cameras/c/picture", "/v1/cameras/c");
+    let patch = |snapshot: Value| {
+        let headers = [("content-type", "application/merge-patch+json"), ("if-match", "*")];
+        let (rest, body) = (&rest, json!({"snapshot": snapshot}).to_string());
+        async move { rest.send("PATCH", profile, &headers, body).await }
+    };
+    let fetch = || rest.send("POST", path, &[], Body::empty());
+    assert_eq!(fetch().await.problem(422, "invalid-argument"), ["snapshot"]);
+    assert_eq!(patch(json!({"url": "rtsp://c/"})).await.problem(422, "invalid-argument"), ["snapshot.url"]);
+    assert_eq!(patch(json!({"url": "http://:1/"})).await.problem(422, "invalid-argument"), ["snapshot.url"]);
+
+    let jpeg = [b"\xff\xd8\xff".as_slice(), &[7; 1_000]].concat();
+    // viewer:s3cret
+    let url = one_answer("Basic dmlld2VyOnMzY3JldA==", jpeg.clone()).await;
+    patch(json!({"url": url, "username": "viewer", "password": "s3cret"})).await.expect(200);
+    // Written back as it was read, the password stays.
+    let shown = rest.get(profile).await.expect(200).json()["snapshot"].clone();
+    assert_eq!(shown, json!({"url": url, "username": "viewer"}));
+    patch(shown).await.expect(200);
+    let fetched = fetch().await.expect(200);
+    assert_eq!((fetched.header("content-type"), &fetched.body[..]), ("image/jpeg", &jpeg[..]));
+    assert_eq!(rest.get(path).await.expect(200).body[..], jpeg[..]);
+    fetch().await.problem(429, "rate-limited");
+    let audit = rest.get("/v1/audit").await.expect(200).json().to_string();
+    assert!(!audit.contains("s3cret"), "{audit}");
+}
+
+#[tokio::test]
+async fn what_is_no_picture_or_too_large_is_not_taken() {
+    let most = crate::config::Limits::default().picture_bytes;
+    let too_large = [b"\xff\xd8\xff".as_slice(), &vec![0; most]].concat();
+    for (expected, file) in
+        [("GET", b"<html>".to_vec()), ("GET", too_large), ("Basic", b"\xff\xd8\xff".to_vec())]
+    {
+        let rest = Rest::with_camera().await;
+        let headers = [("content-type", "application/merge-patch+json"), ("if-match", "*")];
+        let change = json!({"snapshot": {"url": one_answer(expected, file).await}}).to_string();
+        rest.send("PATCH", "/v1/cameras/c", &headers, change).await.expect(200);
+        rest.send("POST", "/v1/cameras/c/picture", &[], Body::empty())
+            .await
+            .problem(502, "snapshot-unavailable");
+        rest.get("/v1/cameras/c/picture").await.expect(204);
+    }
+}
+
 #[tokio::test]
 async fn a_picture_is_set_shown_and_removed() {
     let rest = Rest::with_camera().await;

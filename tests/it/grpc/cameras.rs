@@ -19,6 +19,11 @@ fn yard() -> proto::CameraProfile {
         site: None,
         gnss_bias_sigma_m: Some(1.5),
         location: Some(proto::Position { longitude_deg: Some(103.98678), latitude_deg: Some(30.6280135) }),
+        snapshot: Some(proto::SnapshotSource {
+            url: "http://192.0.2.7/still.jpg".to_owned(),
+            username: Some("viewer".to_owned()),
+            password: None,
+        }),
     }
 }
 

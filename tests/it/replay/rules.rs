@@ -37,6 +37,7 @@ fn options(fake: &Fake) -> ReplayOptions {
         cameras: 1,
         client_name: "test".to_owned(),
         pace: Pace::Unpaced,
+        head_start: Duration::ZERO,
         repetitions: NonZeroU64::MIN,
         duration: None,
         shift: SignedDuration::ZERO,

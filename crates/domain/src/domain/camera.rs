@@ -11,6 +11,7 @@ use super::names::{CameraId, SiteId, TargetClass, check_labels, check_text};
 use super::receiver::Receivers;
 use super::recipe::Recipe;
 use super::sample::SampleCount;
+use super::snapshot::SnapshotSource;
 use crate::geo::Position;
 
 /// Revision number of a profile, from 1.
@@ -47,6 +48,8 @@ pub struct NewCamera {
     pub learn_automatically: bool,
     /// The site whose tracks the camera contributes to.
     pub site: Option<SiteId>,
+    /// Where a still picture of what the camera sees is fetched.
+    pub snapshot: Option<SnapshotSource>,
 }
 
 impl NewCamera {
@@ -67,6 +70,7 @@ impl NewCamera {
             retrain_when_moved: false,
             learn_automatically: true,
             site: None,
+            snapshot: None,
         }
     }
 
@@ -139,11 +143,13 @@ pub struct CameraChange {
     pub learn_automatically: Option<bool>,
     /// New site; `Some(None)` removes the camera from its site.
     pub site: Option<Option<SiteId>>,
+    /// New address of a still picture; `Some(None)` removes it. Without a password, that of the same address is kept.
+    pub snapshot: Option<Option<SnapshotSource>>,
 }
 
 impl CameraChange {
     /// Names of the fields that can be changed, on both transports.
-    pub const FIELDS: [&str; 12] = [
+    pub const FIELDS: [&str; 13] = [
         "display_name",
         "image_size",
         "gnss_error",
@@ -156,6 +162,7 @@ impl CameraChange {
         "retrain_when_moved",
         "learn_automatically",
         "site",
+        "snapshot",
     ];
 
     /// The fields of a profile that are named, by [`Self::FIELDS`].
@@ -174,6 +181,7 @@ impl CameraChange {
             retrain_when_moved: is_named("retrain_when_moved").then_some(profile.retrain_when_moved),
             learn_automatically: is_named("learn_automatically").then_some(profile.learn_automatically),
             site: is_named("site").then_some(profile.site),
+            snapshot: is_named("snapshot").then_some(profile.snapshot),
         }
     }
 
@@ -196,6 +204,10 @@ impl CameraChange {
             retrain_when_moved: self.retrain_when_moved.unwrap_or(profile.retrain_when_moved),
             learn_automatically: self.learn_automatically.unwrap_or(profile.learn_automatically),
             site: self.site.unwrap_or(profile.site),
+            snapshot: match self.snapshot {
+                Some(new) => new.map(|new| new.with_known_password(profile.snapshot.as_ref())),
+                None => profile.snapshot,
+            },
         }
         .check()
     }

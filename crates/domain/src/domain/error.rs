@@ -107,6 +107,8 @@ pub enum ErrorKind {
     PermissionDenied,
     /// The OpenID provider gave no usable answer.
     SignInUnavailable,
+    /// The address of a camera's still picture gave none.
+    SnapshotUnavailable,
     /// The request names a host that this server does not answer for.
     HostNotAllowed,
     /// A web page of another origin asks for a change.

@@ -38,6 +38,7 @@ mod sample_overflow;
 mod score;
 mod site;
 mod site_training;
+mod snapshot;
 mod time;
 mod training_run;
 
@@ -79,6 +80,7 @@ pub use sample_overflow::SampleOverflow;
 pub use score::Score;
 pub use site::{NewSite, Site, SiteChange, SiteKey};
 pub use site_training::{SiteCameraFinding, SiteTrainingOptions, SiteTrainingReport};
+pub use snapshot::SnapshotSource;
 pub use time::{TimeBounds, parse_time, parse_time_in, parse_time_zone};
 pub use training_run::{
     CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,

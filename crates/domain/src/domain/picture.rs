@@ -27,6 +27,16 @@ impl PictureFormat {
         self.into()
     }
 
+    /// The format of a file, by its first bytes.
+    ///
+    /// # Errors
+    /// `UnsupportedMediaType` for any other.
+    pub fn of_file(content: &[u8]) -> Result<Self> {
+        let known =
+            [Self::Jpeg, Self::Png].into_iter().find(|format| content.starts_with(format.signature()));
+        known.ok_or_else(|| unknown_format(""))
+    }
+
     /// The bytes that a file of the format begins with.
     const fn signature(self) -> &'static [u8] {
         match self {

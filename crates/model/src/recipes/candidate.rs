@@ -27,6 +27,12 @@ pub(crate) trait Estimator: fmt::Debug + Sync {
     /// Networks that one fit trains.
     fn networks(&self, is_final: bool) -> u32;
 
+    /// Epochs of a network that take as long as the map of a fit, which has none, at some thousand rows: progress counts
+    /// it as these.
+    fn map_epochs(&self) -> u32 {
+        0
+    }
+
     /// Fits the encoder to rows; its error is not calibrated.
     ///
     /// # Errors
@@ -46,9 +52,10 @@ impl Candidate {
         context.epochs.unwrap_or_else(|| self.estimator.epochs()).max(1)
     }
 
-    /// Epochs of one fit, over all of its networks.
+    /// Epochs of one fit, over all of its networks, and what its map counts as.
     pub(crate) fn total_epochs(&self, context: &FitContext<'_>, is_final: bool) -> u32 {
-        self.estimator.networks(is_final).saturating_mul(self.epochs(context))
+        let epochs = self.estimator.networks(is_final).saturating_mul(self.epochs(context));
+        epochs.saturating_add(self.estimator.map_epochs())
     }
 
     /// Fits the encoder to rows; its error is not calibrated.
@@ -61,9 +68,11 @@ impl Candidate {
         context: &FitContext<'_>,
         phase: &mut Phase<'_, '_>,
     ) -> Result<FittedEncoder, FitError> {
+        phase.advance(0)?;
         let smoothed = self.is_smoothed.then(|| rows.smoothed(&context.noise));
         let rows = smoothed.as_ref().unwrap_or(rows);
         let mut fitted = self.estimator.fit(rows, context, self.epochs(context), phase)?;
+        phase.advance(self.estimator.map_epochs())?;
         let coverage = Coverage::new(rows.rows.iter().map(|row| row.bounding_box));
         match error_source(fitted.parts.recipe) {
             ErrorSource::Formula => coverage.put(&mut fitted.parts.tensors),

@@ -1,4 +1,4 @@
-//! A site: several cameras along a street, in pairs whose views overlap with gaps between the pairs; walkers and
+//! A site: several cameras along a street, in groups whose views overlap with gaps between the groups; walkers and
 //! vehicles, some with a receiver; trackers whose ids break and swap; missed and false detections.
 //!
 //! A site is a function of its [`SiteOptions`] alone. Targets do not hide each other.
@@ -7,6 +7,7 @@ mod groups;
 mod layout;
 mod motion;
 mod options;
+mod still;
 #[cfg(test)]
 mod tests;
 mod tracklets;
@@ -19,6 +20,7 @@ use self::groups::Company;
 use self::layout::SiteCamera;
 use self::motion::Mover;
 pub use self::options::SiteOptions;
+pub use self::still::{Still, site_stills};
 use self::tracklets::CameraTracker;
 use super::noise::{SimulatedReceiver, standard_normal, stream};
 use crate::domain::{
@@ -72,10 +74,9 @@ pub struct SimulatedSite {
 /// Simulates the site of those options.
 #[must_use]
 pub fn simulate_site(options: &SiteOptions) -> SimulatedSite {
-    let origin = Position::new(24.745_3, 59.437_1).expect("constants within range");
-    let plane = LocalPlane::new(origin);
+    let plane = LocalPlane::new(options.origin);
     let cameras = layout::cameras(options);
-    let street_m = layout::street_length_m(options.cameras);
+    let street_m = layout::street_length_m(options);
     let count = options.walkers + options.vehicles;
     let mut movers: Vec<Mover> = (0..count)
         .map(|index| {
@@ -90,7 +91,7 @@ pub fn simulate_site(options: &SiteOptions) -> SimulatedSite {
     let mut carried = carried_receivers(options, &names);
     let mut site = SimulatedSite {
         image_size: cameras[0].image_size(),
-        origin,
+        origin: options.origin,
         cameras: Vec::new(),
         fixes: Vec::new(),
         carriers: carried.iter().map(|it| (it.id.clone(), names[it.target].clone())).collect(),
@@ -116,7 +117,7 @@ pub fn simulate_site(options: &SiteOptions) -> SimulatedSite {
             site.truth.push((time, names[index].clone(), plane.to_position(movers[index].pose().position)));
         }
         for observer in &mut observers {
-            observer.observe(time, &mut movers);
+            observer.observe(time, elapsed_s, &mut movers);
         }
         for receiver in &mut carried {
             let truth = movers[receiver.target].pose().position;
@@ -196,10 +197,12 @@ impl<'a> Observer<'a> {
     }
 
     /// Detects the targets in view at an instant.
-    fn observe(&mut self, time: Timestamp, movers: &mut [Mover]) {
+    fn observe(&mut self, time: Timestamp, elapsed_s: f64, movers: &mut [Mover]) {
+        let pan = self.options.pan_deg_from.filter(|(from_s, _)| elapsed_s >= *from_s);
+        let camera = pan.map_or(self.camera, |(_, by_deg)| self.camera.panned(by_deg));
         let mut seen = Vec::new();
         for (target, mover) in movers.iter_mut().enumerate() {
-            let Some(bounding_box) = self.detect(mover) else { continue };
+            let Some(bounding_box) = self.detect(camera, mover) else { continue };
             // Drawn for every target in view, so that the share changes nothing else.
             if self.detector.random::<f64>() >= self.options.missed_share {
                 seen.push((target, bounding_box, mover.pose().position));
@@ -221,8 +224,8 @@ impl<'a> Observer<'a> {
         }
     }
 
-    fn detect(&mut self, mover: &mut Mover) -> Option<BoundingBox> {
-        let mut edges = self.camera.extents(&mover.body())?;
+    fn detect(&mut self, camera: SiteCamera, mover: &mut Mover) -> Option<BoundingBox> {
+        let mut edges = camera.extents(&mover.body())?;
         for edge in &mut edges {
             *edge += self.options.box_noise_px * standard_normal(&mut self.detector);
         }

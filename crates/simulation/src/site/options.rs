@@ -2,6 +2,8 @@
 
 use jiff::Timestamp;
 
+use crate::geo::Position;
+
 /// Default time of the first frame: 2026-01-05T08:00:00Z, in seconds since 1970.
 const START_S: i64 = 1_767_600_000;
 
@@ -14,8 +16,14 @@ pub struct SiteOptions {
     pub camera_seed: u64,
     /// Seed of the receivers' errors.
     pub receiver_seed: u64,
-    /// Number of cameras: the views of the first two overlap, a gap follows, and so on.
+    /// The foot of the first camera's mast, from which the street goes east.
+    pub origin: Position,
+    /// Number of cameras.
     pub cameras: usize,
+    /// Number of cameras in a group: their views overlap, and a gap follows. At least 1.
+    pub cameras_per_group: usize,
+    /// From that many seconds after the start on, all cameras are rotated by that many degrees to the right.
+    pub pan_deg_from: Option<(f64, f64)>,
     /// Number of walkers.
     pub walkers: usize,
     /// Share of the walkers who walk in groups of two to four.
@@ -54,7 +62,10 @@ impl Default for SiteOptions {
             seed: 1,
             camera_seed: 1,
             receiver_seed: 1,
+            origin: Position::new(24.745_3, 59.437_1).expect("constants within range"),
             cameras: 3,
+            cameras_per_group: 2,
+            pan_deg_from: None,
             walkers: 16,
             group_share: 0.0,
             vehicles: 4,

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::domain::{
     Camera, CameraId, CameraKey, CameraMoved, ClockOffset, Error, ErrorKind, ExpectedVersion, GnssBiasSigma,
     GnssError, ImageSize, ModelMetadata, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision,
-    SampleCount, SigmaM, SiteId, TargetClass, TargetId,
+    SampleCount, SigmaM, SiteId, SnapshotSource, TargetClass, TargetId,
 };
 use crate::geo::Position;
 use crate::refusals::unknown_site;
@@ -115,6 +115,15 @@ struct StoredProfile {
     labels: BTreeMap<String, String>,
     receivers: Vec<StoredReceiver>,
     retrain_when_moved: bool,
+    snapshot: Option<StoredSnapshot>,
+}
+
+/// Where a still picture is fetched, as it is stored.
+#[derive(Serialize, Deserialize)]
+struct StoredSnapshot {
+    url: String,
+    username: Option<String>,
+    password: Option<String>,
 }
 
 /// A receiver as it is stored.
@@ -147,6 +156,11 @@ pub(crate) fn write_profile(profile: &NewCamera) -> Result<String> {
         labels: profile.labels.clone(),
         receivers: profile.receivers.iter().map(receiver).collect(),
         retrain_when_moved: profile.retrain_when_moved,
+        snapshot: profile.snapshot.as_ref().map(|source| StoredSnapshot {
+            url: source.url().to_owned(),
+            username: source.username().map(str::to_owned),
+            password: source.password().map(str::to_owned),
+        }),
     };
     serde_json::to_string(&stored).map_err(Error::fault)
 }
@@ -157,6 +171,7 @@ fn read_profile(json: &str, id: CameraId) -> Result<NewCamera> {
     let location = stored.location_deg.map(|(longitude, latitude)| Position::new(longitude, latitude));
     let target_classes = stored.target_classes.iter().map(|class| TargetClass::new(class));
     let receivers = stored.receivers.iter().map(StoredReceiver::to_domain);
+    let snapshot = stored.snapshot.map(|it| SnapshotSource::new(&it.url, it.username, it.password));
     Ok(NewCamera {
         display_name: stored.display_name,
         image_size: image_size.transpose()?,
@@ -171,6 +186,7 @@ fn read_profile(json: &str, id: CameraId) -> Result<NewCamera> {
         labels: stored.labels,
         receivers: Receivers::new(receivers.collect::<Result<Vec<_>>>()?)?,
         retrain_when_moved: stored.retrain_when_moved,
+        snapshot: snapshot.transpose()?,
         ..NewCamera::named(id)
     })
 }

@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use super::*;
 use crate::domain::{
     Camera, ClockOffset, GnssBiasSigma, GnssError, ImageSize, Receiver, ReceiverId, Receivers, Revision,
-    SampleCount, SigmaM, TargetClass,
+    SampleCount, SigmaM, SnapshotSource, TargetClass,
 };
 use crate::{CameraVersion, ChangeMark, SampleFilter};
 
@@ -35,6 +35,10 @@ fn full(name: &str) -> NewCamera {
         retrain_when_moved: true,
         learn_automatically: false,
         site: None,
+        snapshot: Some(
+            SnapshotSource::new("http://192.0.2.7/", Some("viewer".to_owned()), Some("s3cret".to_owned()))
+                .expect("an address"),
+        ),
     }
 }
 

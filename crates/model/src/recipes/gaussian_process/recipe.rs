@@ -24,10 +24,10 @@ use crate::progress::{FitError, Phase};
 use crate::recipes::{Candidate, Definition, ErrorSource, Estimator, FitContext};
 use crate::samples::rows::TrainingRows;
 
-/// Median height of a target in m, and the standard deviation of its logarithm, by class; the last is for
-/// all other classes, whose heights only have to agree with each other.
+/// Median height of a target in m, and the standard deviation of its logarithm, by class in either case; the last is for
+/// all other classes, whose heights only have to agree with each other. ONVIF and Axis say `Human`, DeepStream `Person`.
 const TARGET_HEIGHTS: [(&[&str], (f64, f64)); 3] =
-    [(&["person", "pedestrian"], (1.70, 0.05)), (&["car"], (1.50, 0.10)), (&[], (1.70, 1.0))];
+    [(&["person", "pedestrian", "human"], (1.70, 0.05)), (&["car"], (1.50, 0.10)), (&[], (1.70, 1.0))];
 
 /// The recipe.
 pub(crate) static DEFINITION: Definition = Definition {
@@ -49,6 +49,10 @@ impl Estimator for GaussianProcess {
         u32::from(is_final)
     }
 
+    fn map_epochs(&self) -> u32 {
+        150
+    }
+
     fn fit(
         &self,
         rows: &TrainingRows,
@@ -68,7 +72,7 @@ pub(crate) fn target_height_m<'a>(classes: impl Iterator<Item = Option<&'a Targe
         all += 1;
         let Some(class) = class else { continue };
         for (count, (names, _)) in counts.iter_mut().zip([person, car]) {
-            *count += usize::from(names.contains(&class.as_str()));
+            *count += usize::from(names.iter().any(|name| name.eq_ignore_ascii_case(class.as_str())));
         }
     }
     match counts {

@@ -14,7 +14,7 @@ use super::projective_mean::{Box4, COEFFICIENTS};
 use super::upright_camera::UprightCamera;
 use crate::artifact::ModelParts;
 use crate::artifact::tensors::{LARGEST_WEIGHTS_BYTES, Tensors};
-use crate::domain::Recipe;
+use crate::domain::{Recipe, TargetClass};
 use crate::encoder::features::features_of;
 use crate::geo::{EastNorth, LocalPlane};
 use crate::simulation::{Options, Scene, simulate, standard_normal};
@@ -406,4 +406,21 @@ fn boxes_without_a_fix_sharpen_the_geometry_of_few_receivers() {
     }
     println!("mean {paired_m:.2} m, with all boxes {all_m:.2} m");
     assert!(all_m < paired_m, "{all_m} {paired_m}");
+}
+
+/// Frigate says `person`, ONVIF and Axis `Human`, DeepStream `Person`, KITTI `Pedestrian` and `Car`.
+#[test]
+fn heights_are_known_by_the_names_of_all_detectors() {
+    let height_m = |class: &str| {
+        let class = TargetClass::new(class).expect("a class");
+        super::target_height_m(std::iter::repeat_n(Some(&class), 3)).0
+    };
+    for (class, expected) in
+        [("person", 1.70), ("Human", 1.70), ("Person", 1.70), ("Pedestrian", 1.70), ("Car", 1.50)]
+    {
+        let class = TargetClass::new(class).expect("a class");
+        assert!(super::GroundCamera::knows_height_of(&class), "{class:?}");
+        assert_eq!(height_m(class.as_str()), expected, "{class:?}");
+    }
+    assert!(!super::GroundCamera::knows_height_of(&TargetClass::new("ship").expect("a class")));
 }

@@ -70,6 +70,10 @@ impl Estimator for Variant {
         u32::from(self.residual)
     }
 
+    fn map_epochs(&self) -> u32 {
+        20
+    }
+
     fn fit(
         &self,
         rows: &TrainingRows,

@@ -1,0 +1,68 @@
+//! The demonstration that the server shows, and its end.
+
+use std::sync::Mutex;
+
+use tokio_util::sync::CancellationToken;
+
+use super::App;
+use crate::domain::{CameraId, ConnectionId, ErrorKind, Result, SiteId};
+
+/// What a demonstration has made, which its end removes.
+#[derive(Debug, Clone, Default)]
+pub struct DemonstrationParts {
+    pub cameras: Vec<CameraId>,
+    pub sites: Vec<SiteId>,
+    pub connections: Vec<ConnectionId>,
+}
+
+/// The demonstration, if one is shown.
+#[derive(Default)]
+pub struct Demonstration(Mutex<Option<(DemonstrationParts, CancellationToken)>>);
+
+impl Demonstration {
+    /// Notes that a demonstration is shown; it ends when the token is cancelled.
+    #[must_use]
+    pub fn begin(&self, parts: DemonstrationParts) -> CancellationToken {
+        let stop = CancellationToken::new();
+        *self.lock() = Some((parts, stop.clone()));
+        stop
+    }
+
+    /// True while simulated devices send to the server, or what they need is not removed yet.
+    #[must_use]
+    pub fn is_shown(&self) -> bool {
+        self.lock().is_some()
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Option<(DemonstrationParts, CancellationToken)>> {
+        self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+}
+
+impl App {
+    /// Ends the demonstration and removes its cameras, sites and connections with all that they have stored. Does nothing
+    /// if none is shown. After an error it can be repeated.
+    ///
+    /// # Errors
+    /// `RunLive` while one of its cameras is trained; a fault of the store.
+    pub async fn end_demonstration(&self) -> Result<()> {
+        let Some((parts, stop)) = self.demonstration.lock().clone() else { return Ok(()) };
+        stop.cancel();
+        for id in &parts.connections {
+            removed(self.delete_connection(id, None).await, ErrorKind::ConnectionNotFound)?;
+        }
+        for id in &parts.cameras {
+            removed(self.cameras().delete(id, None).await, ErrorKind::CameraNotFound)?;
+        }
+        for id in &parts.sites {
+            removed(self.sites().delete(id, None).await, ErrorKind::SiteNotFound)?;
+        }
+        *self.demonstration.lock() = None;
+        Ok(())
+    }
+}
+
+/// What somebody else has removed before is removed.
+fn removed(outcome: Result<()>, missing: ErrorKind) -> Result<()> {
+    outcome.or_else(|error| if error.kind() == missing { Ok(()) } else { Err(error) })
+}

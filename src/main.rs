@@ -10,7 +10,7 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 fn main() -> ExitCode {
     match sightfix::cli::Cli::from_arguments().run() {
         Ok(()) => ExitCode::SUCCESS,
-        // The reader of standard output wants no more: not a failure.
+        // The reader of standard output wants nothing further: not a failure.
         Err(_) if sightfix::cli::reader_is_gone() => ExitCode::SUCCESS,
         Err(error) => {
             // Unlike `eprintln!`, no panic where standard error is closed or full.

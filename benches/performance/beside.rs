@@ -23,7 +23,7 @@ pub(crate) fn run() {
         let mut cameras = Vec::new();
         for number in 0..cores {
             let id = CameraId::new(&format!("busy-{number}")).expect("a slug");
-            served.app.create_camera(NewCamera::named(id.clone())).await.expect("a new camera");
+            served.app.cameras().create(NewCamera::named(id.clone())).await.expect("a new camera");
             served
                 .app
                 .store
@@ -42,14 +42,14 @@ pub(crate) fn run() {
             for id in &cameras {
                 let wish =
                     RunRequest { recipe: Some(Recipe::Paper), epochs: Some(10_000), ..RunRequest::default() };
-                runs.push((id, served.app.start_run(id, wish, None).await.expect("a run").id));
+                runs.push((id, served.app.training().start(id, wish, None).await.expect("a run").id));
             }
             // Until the fits are under way.
             tokio::time::sleep(std::time::Duration::from_millis(700)).await;
             let (busy, mut busy_times) = load::send(served.address, &request, EACH).await;
             for (id, run) in runs {
-                served.app.cancel_run(id, run).await.expect("the run still goes");
-                while !served.app.run(id, run).await.expect("the run").state.has_ended() {
+                served.app.training().cancel(id, run).await.expect("the run still goes");
+                while !served.app.training().get(id, run).await.expect("the run").state.has_ended() {
                     tokio::time::sleep(std::time::Duration::from_millis(20)).await;
                 }
             }

@@ -41,7 +41,7 @@ fn with_keys_and_limits() {
     let secret = runtime.block_on(async {
         let scope = Scope::new(Role::Edge, vec![guarded.camera.clone()]).expect("one camera");
         let key = NewKey::new("bench", scope, None, guarded.app.clock.now()).expect("a name");
-        guarded.app.create_key(&key).await.expect("a new key").1
+        guarded.app.keys().create(&key).await.expect("a new key").1
     });
     let body = request_body(&open.observations[..1]);
     let path = format!("/v1/cameras/{}/fusions", open.camera);

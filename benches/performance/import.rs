@@ -23,7 +23,7 @@ pub(crate) fn run() {
     let new_camera = || {
         let name = format!("import-{}", round.fetch_add(1, Ordering::Relaxed));
         let id = CameraId::new(&name).expect("a slug");
-        runtime.block_on(served.app.create_camera(NewCamera::named(id.clone()))).expect("a new camera");
+        runtime.block_on(served.app.cameras().create(NewCamera::named(id.clone()))).expect("a new camera");
         id
     };
     ratio::head(

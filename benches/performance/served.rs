@@ -50,7 +50,7 @@ impl Served {
         let camera = CameraId::new("bench").expect("a slug");
         let world = simulate(&Options::demo());
         let profile = NewCamera { image_size: Some(world.image_size), ..NewCamera::named(camera.clone()) };
-        app.create_camera(profile).await.expect("a new camera");
+        app.cameras().create(profile).await.expect("a new camera");
         let samples = world.training_samples();
         let observations = samples
             .iter()
@@ -68,9 +68,9 @@ impl Served {
 
     /// Trains and waits.
     pub(crate) async fn train(&self, request: RunRequest) {
-        let run = self.app.start_run(&self.camera, request, None).await.expect("a run");
+        let run = self.app.training().start(&self.camera, request, None).await.expect("a run");
         loop {
-            let run = self.app.run(&self.camera, run.id).await.expect("the run");
+            let run = self.app.training().get(&self.camera, run.id).await.expect("the run");
             if run.state.has_ended() {
                 assert!(run.model_version.is_some(), "{:?}", run.outcome);
                 return;

@@ -88,6 +88,17 @@ test('each source makes a camera, and in German, too', async ({ console: page, s
     expect(items.find((it) => JSON.stringify(it.source.cameras).includes(`"${id}"`))?.source).toMatchObject({ format, topics: ['site/boxes'] });
   }
   await page.goto(`${server.url}/#/cameras`);
+  const stream = await choose(page, /^ONVIF camera/, 'Stream');
+  await expect(stream.getByLabel(/^Address/)).toHaveValue(/^rtsp:/);
+  await expect(stream.getByLabel(/^Topics/)).toBeHidden();
+  await stream.getByLabel(/^Address/).fill('rtsp://127.0.0.1:9/metadata');
+  await stream.getByLabel('User', { exact: true }).fill('operator');
+  await stream.getByLabel('Password').fill('secret');
+  await setSize(stream);
+  await stream.getByRole('button', { name: 'Connect and look at the boxes' }).click();
+  await expect(page.getByRole('heading', { level: 1, name: 'Stream' })).toBeVisible();
+  expect(await server.request('GET', '/v1/connections/onvif-stream')).toMatchObject({ source: { format: 'onvif', address: 'rtsp://127.0.0.1:9/metadata', username: 'operator' }, secret_names: ['password'] });
+  await page.goto(`${server.url}/#/cameras`);
   const dialog = await choose(page, /^Edge client/, 'Yard');
   await dialog.getByRole('button', { name: 'Create camera' }).click();
   await expect(page.getByText('sightfix-edge --source')).toContainText('--camera yard');

@@ -9,7 +9,7 @@ import { createInterface } from 'node:readline';
 /** A topic of the test's own. */
 const READY = 'test/ready';
 
-async function freePort(): Promise<number> {
+export async function freePort(): Promise<number> {
   const server = createServer();
   await new Promise<void>((done) => server.listen(0, '127.0.0.1', done));
   const { port } = server.address() as AddressInfo;

@@ -1,4 +1,5 @@
-// From a detector's broker and the phone in a pocket to a trained camera and to Home Assistant, by the console alone.
+// From a detector's broker, or a camera's own stream, and the phone in a pocket to a trained camera and to Home Assistant, by
+// the console alone.
 import { execFileSync } from 'node:child_process';
 import { mkdtempSync, readFileSync, rmSync } from 'node:fs';
 import { tmpdir } from 'node:os';
@@ -7,15 +8,24 @@ import type { Locator, Page } from '@playwright/test';
 import { distance_m } from '../src/lib/geo';
 import { Broker } from './broker';
 import { accessibilityFindings, expect, test as base } from './fixtures';
-import { BINARY } from './server';
+import { RtspCamera } from './rtsp_camera';
+import { BINARY, type Server } from './server';
 
-const test = base.extend<{ broker: Broker }>({
+const test = base.extend<{ broker: Broker; stream: RtspCamera }>({
   broker: async ({}, use) => {
     const broker = await Broker.start();
     await use(broker);
     broker.stop();
   },
+  stream: async ({}, use) => {
+    const stream = await RtspCamera.start();
+    await use(stream);
+    stream.stop();
+  },
 });
+
+/** Size of the square's image, px. */
+const [WIDTH_PX, HEIGHT_PX] = [1280, 720];
 
 /** Recorded time after which the camera must have its model, s. */
 const LEARNT_FROM_S = 600;
@@ -59,8 +69,51 @@ function simulateSquare(): Square {
   return { boxes, fixes, truth: new Map(own.map(({ time_ms, cells }) => [time_ms, { longitude_deg: Number(cells[1]), latitude_deg: Number(cells[2]) }])) };
 }
 
+/** Where the boxes come from: what the dialog is told, and how boxes of people and cars are sent. */
+interface Detector {
+  button: RegExp;
+  person: string;
+  fill(dialog: Locator): Promise<void>;
+  send(people: Row[], cars?: Row[]): void;
+}
+
+const frigate = (broker: Broker): Detector => ({
+  button: /^Frigate/,
+  person: 'person',
+  fill: async (dialog) => {
+    await dialog.getByLabel(/^Address/).fill(broker.address);
+    await dialog.getByLabel(/^Name of the camera/).fill('front_door');
+  },
+  send: (people, cars = []) => broker.publish('frigate/events', [...people.map((row) => frigateEvent(row, 'person')), ...cars.map((row) => frigateEvent(row, 'car'))]),
+});
+
+const onvif = (stream: RtspCamera): Detector => ({
+  button: /^ONVIF camera/,
+  person: 'Human',
+  fill: async (dialog) => {
+    await dialog.getByLabel(/^Address/).fill(stream.address);
+    await dialog.getByLabel('User', { exact: true }).fill(stream.user);
+    await dialog.getByLabel('Password').fill(stream.password);
+  },
+  send: (people, cars = []) => {
+    const frames = new Map<number, (Row & { label: string })[]>();
+    for (const row of [...people.map((it) => ({ ...it, label: 'Human' })), ...cars.map((it) => ({ ...it, label: 'Vehicle' }))]) frames.set(row.time_ms, [...(frames.get(row.time_ms) ?? []), row]);
+    stream.send([...frames].map(([time_ms, rows]) => onvifFrame(time_ms, rows)));
+  },
+});
+
+/** A frame of ONVIF metadata in pixels, with the elements that Hanwha's cameras have. */
+function onvifFrame(time_ms: number, rows: (Row & { label: string })[]): string {
+  const objects = rows.map(({ cells: [id, left, top, width, height], label }) => {
+    const [right, bottom] = [Number(left) + Number(width), Number(top) + Number(height)];
+    return `<tt:Object ObjectId="${id}" Parent="0"><tt:Appearance><tt:Shape><tt:BoundingBox left="${left}" top="${top}" right="${right}" bottom="${bottom}"/></tt:Shape><tt:Class><tt:Type Likelihood="0.88">${label}</tt:Type></tt:Class></tt:Appearance></tt:Object>`;
+  });
+  const transformation = `<tt:Transformation><tt:Translate x="-1" y="1"/><tt:Scale x="${2 / WIDTH_PX}" y="${-2 / HEIGHT_PX}"/></tt:Transformation>`;
+  return `<tt:MetadataStream xmlns:tt="http://www.onvif.org/ver10/schema"><tt:VideoAnalytics><tt:Frame UtcTime="${new Date(time_ms).toISOString()}">${transformation}${objects.join('')}</tt:Frame></tt:VideoAnalytics></tt:MetadataStream>`;
+}
+
 /** An event of Frigate with the state after a change. */
-function frigateEvent({ time_ms, cells: [id, left, top, width, height] }: Row, label = 'person'): string {
+function frigateEvent({ time_ms, cells: [id, left, top, width, height] }: Row, label: string): string {
   const [x, y] = [Number(left), Number(top)];
   const box = [x, y, x + Number(width), y + Number(height)];
   return JSON.stringify({ type: 'update', before: {}, after: { id: `1607123955.475377-${id}`, camera: 'front_door', label, false_positive: false, frame_time: time_ms / 1000, score: 0.88, box } });
@@ -75,6 +128,14 @@ async function settingsOf(dialog: Locator): Promise<Record<string, string>> {
 const step = (page: Page, name: RegExp): Locator => page.getByRole('listitem').filter({ has: page.getByRole('heading', { name }) });
 
 test('one phone among eleven people trains a camera of Frigate, and Home Assistant follows it', async ({ console: page, server, broker }) => {
+  await learnAndFollow(page, server, broker, frigate(broker));
+});
+
+test('one phone among eleven people trains an ONVIF camera of RTSP, and Home Assistant follows it', async ({ console: page, server, broker, stream }) => {
+  await learnAndFollow(page, server, broker, onvif(stream));
+});
+
+async function learnAndFollow(page: Page, server: Server, broker: Broker, detector: Detector): Promise<void> {
   // Training runs at the lowest priority: on a busy machine it takes as long as it takes.
   test.setTimeout(1_800_000);
   const square = simulateSquare();
@@ -85,16 +146,15 @@ test('one phone among eleven people trains a camera of Frigate, and Home Assista
   await page.context().request.post(`${server.url}/v1/session`, { data: { key: secret } });
   await page.goto(server.url);
 
-  // The camera, by Frigate's broker.
+  // The camera, by its detector.
   await page.getByRole('button', { name: 'Add camera' }).first().click();
   const dialog = page.getByRole('dialog');
   expect(await accessibilityFindings(page)).toEqual([]);
-  await dialog.getByRole('button', { name: /^Frigate/ }).click();
+  await dialog.getByRole('button', { name: detector.button }).click();
   await dialog.getByLabel('Name', { exact: true }).fill('Square');
-  await dialog.getByLabel(/^Address/).fill(broker.address);
-  await dialog.getByLabel(/^Name of the camera/).fill('front_door');
-  await dialog.getByLabel('Image width, px').fill('1280');
-  await dialog.getByLabel('Image height, px').fill('720');
+  await detector.fill(dialog);
+  await dialog.getByLabel('Image width, px').fill(String(WIDTH_PX));
+  await dialog.getByLabel('Image height, px').fill(String(HEIGHT_PX));
   expect(await accessibilityFindings(page)).toEqual([]);
   await dialog.getByRole('button', { name: 'Connect and look at the boxes' }).click();
   const boxes = step(page, /See the boxes/);
@@ -102,13 +162,13 @@ test('one phone among eleven people trains a camera of Frigate, and Home Assista
 
   // Its boxes as they come, of people alone.
   const some = square.boxes.filter(within(0, 5));
-  const parked = some.map((row) => frigateEvent({ ...row, cells: ['parked', '900', '500', '200', '120'] }, 'car'));
+  const parked = some.map((row) => ({ ...row, cells: ['parked', '900', '500', '200', '120'] }));
   await expect(async () => {
     // The page may only just begin to listen.
-    broker.publish('frigate/events', [...some.map((row) => frigateEvent(row)), ...parked]);
+    detector.send(some, parked);
     await expect(boxes.getByRole('img', { name: /Picture with [1-9]\d* boxes/ })).toBeVisible({ timeout: 2000 });
   }).toPass();
-  await boxes.getByRole('button', { name: 'person', exact: true }).click();
+  await boxes.getByRole('button', { name: detector.person, exact: true }).click();
   await boxes.getByRole('button', { name: 'Save the filter' }).click();
   await expect(page.getByText('The filter is saved')).toBeVisible();
   await boxes.getByRole('button', { name: /start learning/ }).click();
@@ -133,7 +193,7 @@ test('one phone among eleven people trains a camera of Frigate, and Home Assista
   const send = async (from_s: number, until_s: number, slice_s: number, pause_ms = 0): Promise<void> => {
     for (let at_s = from_s; at_s < until_s; at_s += slice_s) {
       const isOfSlice = within(at_s, Math.min(at_s + slice_s, until_s));
-      broker.publish('frigate/events', square.boxes.filter(isOfSlice).map((row) => frigateEvent(row)));
+      detector.send(square.boxes.filter(isOfSlice));
       for (const fix of square.fixes.filter(isOfSlice)) await sendFix(fix);
       await page.waitForTimeout(pause_ms);
     }
@@ -184,4 +244,4 @@ test('one phone among eleven people trains a camera of Frigate, and Home Assista
   expect(errors_m.length).toBeGreaterThan(50);
   // The phone alone is off by 2.6 m per axis, which is 3.3 m on average.
   expect(mean_m).toBeLessThan(2.5);
-});
+}

@@ -30,7 +30,7 @@ test('every state is told from the others, with its numbers', async ({ console: 
   await change(page, {
     moved: (status) => {
       const it = like(status);
-      return { ...it, camera: { ...it.camera, moved: { model_version: 1, began_at: ago(9), raised_at: ago(8), shift_east_m: 3, shift_north_m: 4, statistic: 30, targets: 4 } } };
+      return { ...it, camera: { ...it.camera, moved: { model_version: 1, onset_at: ago(9), raised_at: ago(8), shift_east_m: 3, shift_north_m: 4, statistic: 30, targets: 4 } } };
     },
     stale: (status) => ({ ...like(status), last_observed_at: ago(16) }),
     idle: (status) => ({ ...like(status), last_observed_at: ago(3), streams: 2 }),

@@ -30,7 +30,7 @@ pub struct Target {
 }
 
 /// All kinds of input.
-pub const TARGETS: [Target; 12] = [
+pub const TARGETS: [Target; 14] = [
     Target { name: "csv", run: csv, seeds: || texts(&[CSV]) },
     Target { name: "ndjson", run: ndjson, seeds: || texts(&[SAMPLE_JSON]) },
     Target { name: "json", run: json, seeds: || texts(&[SAMPLE_JSON, OBSERVATION_JSON]) },
@@ -38,6 +38,12 @@ pub const TARGETS: [Target; 12] = [
     Target { name: "gpx", run: |input| fixes(input, FixFormat::Gpx), seeds: || texts(&[GPX]) },
     Target { name: "gpsd", run: |input| fixes(input, FixFormat::Gpsd), seeds: || texts(&[GPSD]) },
     Target { name: "rtklib", run: |input| fixes(input, FixFormat::Rtklib), seeds: || texts(&[RTKLIB]) },
+    Target { name: "fit", run: |input| fixes(input, FixFormat::Fit), seeds: || vec![FIT.to_vec()] },
+    Target {
+        name: "gnss_logger",
+        run: |input| fixes(input, FixFormat::GnssLogger),
+        seeds: || texts(&[GNSS_LOGGER]),
+    },
     Target { name: "protobuf", run: protobuf, seeds: protobuf_seeds },
     Target { name: "model", run: model, seeds: || vec![DEMO_MODEL.to_vec()] },
     Target { name: "cursor", run: cursor, seeds: || texts(&["Y2FtZXJhczpj", "bW9kZWxzOjc"]) },
@@ -62,6 +68,10 @@ const GPSD: &str = "{\"class\":\"TPV\",\"device\":\"/dev/ttyACM0\",\"mode\":3,\
     \"time\":\"2026-01-01T00:00:00.000Z\",\"lat\":59.4371,\"lon\":24.7453,\"epx\":1.5,\"epy\":2.5}\n";
 const RTKLIB: &str = "%  GPST  latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m)\n\
     2026/09/18 16:47:34.000 23.837350600 90.262550200 -36.2680 1 12 0.0034 0.0029\n2436 492454.5 23.8 90.2 0 5 7 1 1\n";
+/// One position of an activity.
+const FIT: &[u8] = b"\x0c\x10\x00\x00 \x00\x00\x00.FIT@\x00\x00\x14\x00\x04\xfd\x04\x86\x00\x04\x85\x01\x04\x85\x1f\x01\x02\x00T(\x80DA\xa8\xc7\x1517\xf2I\x05\xb3\xff";
+const GNSS_LOGGER: &str = "# Fix,Provider,LatitudeDegrees,LongitudeDegrees,AltitudeMeters,SpeedMps,AccuracyMeters,\
+    BearingDegrees,UnixTimeMillis,MockLocation\nFix,gps,30.628,103.98678,500,1.1,3.8,20,1780315220500,0\n";
 const SETTINGS: &str = "data = \"data\"\nlisten = \"127.0.0.1:8080\"\nallowed_hosts = [\"a.example\"]\n\
     [training]\nworkers = 1\n[limits]\nbody_bytes = 1048576\nclient_share = 0.5\n";
 const DEMO_MODEL: &[u8] = include_bytes!("../../models/demo-square.safetensors");

@@ -155,7 +155,7 @@ mod tests {
         assert_eq!(allowed(client(1), begin), 3);
         assert_eq!(allowed(client(2), begin), 3, "another client has its own");
         assert_eq!(allowed(client(1), begin + Duration::from_millis(340)), 1);
-        assert_eq!(allowed(client(1), begin + 100 * REFILL_TIME), 3, "a pause saves up no more");
+        assert_eq!(allowed(client(1), begin + 100 * REFILL_TIME), 3, "a longer pause adds nothing");
         let refused = limit.count(client(1), begin + 100 * REFILL_TIME).expect_err("the bucket is empty");
         assert_eq!(refused.kind(), ErrorKind::RateLimited);
         let unlimited = RateLimit::new("requests", 0);

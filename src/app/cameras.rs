@@ -1,19 +1,38 @@
 //! Camera profiles.
 
 use super::pictures::check_snapshot;
+use super::registry::Registry;
 use super::{App, Page, page_of};
+use crate::clock::Clock;
 use crate::domain::{Camera, CameraChange, CameraId, ExpectedVersion, NewCamera, Result, SiteId};
+use crate::store::Store;
+
+/// The use cases of cameras and their profiles.
+#[derive(Clone, Copy)]
+pub struct Cameras<'a> {
+    store: &'a Store,
+    registry: &'a Registry,
+    clock: &'a Clock,
+}
 
 impl App {
+    /// The use cases of cameras and their profiles.
+    #[must_use]
+    pub fn cameras(&self) -> Cameras<'_> {
+        Cameras { store: &self.store, registry: &self.registry, clock: &self.clock }
+    }
+}
+
+impl Cameras<'_> {
     /// Stores a new camera.
     ///
     /// # Errors
     /// `CameraExists`; `InvalidArgument` naming the field.
-    pub async fn create_camera(&self, profile: NewCamera) -> Result<Camera> {
+    pub async fn create(&self, profile: NewCamera) -> Result<Camera> {
         let profile = profile.check()?;
         check_snapshot(&profile)?;
         let camera = self.store.insert_camera(&profile, self.clock.now()).await?;
-        self.registry.refresh_camera(&self.store, camera.id()).await?;
+        self.registry.refresh_camera(self.store, camera.id()).await?;
         Ok(camera)
     }
 
@@ -21,7 +40,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn camera(&self, id: &CameraId) -> Result<Camera> {
+    pub async fn get(&self, id: &CameraId) -> Result<Camera> {
         self.store.camera(id).await
     }
 
@@ -29,7 +48,7 @@ impl App {
     ///
     /// # Errors
     /// `SiteNotFound`.
-    pub async fn cameras(
+    pub async fn list(
         &self,
         site: Option<&SiteId>,
         after: Option<&CameraId>,
@@ -44,7 +63,7 @@ impl App {
 
     /// Warnings about fields that the profile leaves out, and about an active model that does not fit the profile.
     #[must_use]
-    pub fn camera_warnings(&self, camera: &Camera) -> Vec<String> {
+    pub fn warnings(&self, camera: &Camera) -> Vec<String> {
         let mut warnings = camera.profile.warnings();
         let active = self.registry.get(camera.id());
         let trained = active.and_then(|active| active.model().and_then(|(model, _)| model.image_size()));
@@ -67,7 +86,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`, `RevisionMismatch`, `InvalidArgument` naming the field.
-    pub async fn change_camera(
+    pub async fn change(
         &self,
         id: &CameraId,
         change: CameraChange,
@@ -80,7 +99,7 @@ impl App {
         let profile = change.apply(camera.profile)?;
         check_snapshot(&profile)?;
         let camera = self.store.replace_camera(&profile, Some(expected), self.clock.now()).await?;
-        self.registry.refresh_camera(&self.store, id).await?;
+        self.registry.refresh_camera(self.store, id).await?;
         Ok(camera)
     }
 
@@ -88,7 +107,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`, `RevisionMismatch`, `RunLive`.
-    pub async fn delete_camera(&self, id: &CameraId, expected: Option<ExpectedVersion>) -> Result<()> {
+    pub async fn delete(&self, id: &CameraId, expected: Option<ExpectedVersion>) -> Result<()> {
         self.store.delete_camera(id, expected, self.clock.now()).await?;
         self.registry.forget(id).await;
         Ok(())

@@ -52,10 +52,10 @@ impl App {
             removed(self.delete_connection(id, None).await, ErrorKind::ConnectionNotFound)?;
         }
         for id in &parts.cameras {
-            removed(self.delete_camera(id, None).await, ErrorKind::CameraNotFound)?;
+            removed(self.cameras().delete(id, None).await, ErrorKind::CameraNotFound)?;
         }
         for id in &parts.sites {
-            removed(self.delete_site(id, None).await, ErrorKind::SiteNotFound)?;
+            removed(self.sites().delete(id, None).await, ErrorKind::SiteNotFound)?;
         }
         *self.demonstration.lock() = None;
         Ok(())

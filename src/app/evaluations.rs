@@ -3,12 +3,14 @@
 use jiff::{SignedDuration, Timestamp};
 
 use super::training::check_extent;
-use super::{App, Page, page_of};
+use super::{App, JobQueue, Page, page_of};
+use crate::clock::{Clock, Randomness};
+use crate::config::Limits;
 use crate::domain::{
     Camera, CameraId, Error, EvaluationId, EvaluationJob, EvaluationPlan, GnssError, InferenceMode, Method,
     Result, SigmaM, TimeRange, Truth,
 };
-use crate::store::SampleFilter;
+use crate::store::{SampleFilter, Store};
 
 /// Share of the samples, the latest ones, that is tested on by default.
 pub const DEFAULT_TEST_SHARE: f64 = 0.2;
@@ -39,20 +41,44 @@ pub struct EvaluationRequest {
     pub gnss_sigma: Option<SigmaM>,
 }
 
+/// The use cases of evaluations.
+#[derive(Clone, Copy)]
+pub struct Evaluations<'a> {
+    store: &'a Store,
+    clock: &'a Clock,
+    randomness: &'a Randomness,
+    limits: &'a Limits,
+    queue: &'a JobQueue,
+}
+
 impl App {
+    /// The use cases of evaluations.
+    #[must_use]
+    pub fn evaluations(&self) -> Evaluations<'_> {
+        Evaluations {
+            store: &self.store,
+            clock: &self.clock,
+            randomness: &self.randomness,
+            limits: &self.limits,
+            queue: &self.evaluation_queue,
+        }
+    }
+}
+
+impl Evaluations<'_> {
     /// Queues an evaluation.
     ///
     /// # Errors
     /// `CameraNotFound`; `InvalidArgument` naming the field; `UnusableSamples` if there are too few
     /// to learn from; `Overloaded` beyond the limit of live evaluations.
-    pub async fn start_evaluation(&self, id: &CameraId, request: EvaluationRequest) -> Result<EvaluationJob> {
+    pub async fn start(&self, id: &CameraId, request: EvaluationRequest) -> Result<EvaluationJob> {
         let camera = self.store.camera(id).await?;
         let plan = self.plan(&camera, request).await?;
         let now = self.clock.now();
         let evaluation = EvaluationId(self.randomness.uuid_v7(now));
         let most = self.limits.live_evaluations;
         let queued = self.store.insert_evaluation(evaluation, id, &plan, most, now).await?;
-        self.evaluation_queue.notify();
+        self.queue.notify();
         Ok(queued)
     }
 
@@ -60,7 +86,7 @@ impl App {
     ///
     /// # Errors
     /// `EvaluationNotFound`.
-    pub async fn evaluation(&self, id: EvaluationId) -> Result<(EvaluationJob, Option<String>)> {
+    pub async fn get(&self, id: EvaluationId) -> Result<(EvaluationJob, Option<String>)> {
         let job = self.store.evaluation(id).await?;
         let report = if job.state.has_ended() { self.store.evaluation_report(id).await? } else { None };
         Ok((job, report))
@@ -70,7 +96,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn evaluations(
+    pub async fn list(
         &self,
         camera: Option<&CameraId>,
         before: Option<EvaluationId>,
@@ -84,7 +110,7 @@ impl App {
     ///
     /// # Errors
     /// `EvaluationNotFound`, `EvaluationEnded`.
-    pub async fn cancel_evaluation(&self, id: EvaluationId) -> Result<EvaluationJob> {
+    pub async fn cancel(&self, id: EvaluationId) -> Result<EvaluationJob> {
         self.store.cancel_evaluation(id, self.clock.now()).await
     }
 
@@ -92,7 +118,7 @@ impl App {
     ///
     /// # Errors
     /// `EvaluationNotFound`.
-    pub async fn delete_evaluation(&self, id: EvaluationId) -> Result<()> {
+    pub async fn delete(&self, id: EvaluationId) -> Result<()> {
         self.store.delete_evaluation(id, self.clock.now()).await
     }
 

@@ -72,11 +72,7 @@ impl App {
     /// # Errors
     /// `PermissionDenied` if the caller is a device of other cameras; `CameraNotFound`; a fault of the store.
     pub async fn active_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
-        self.caller().authorize_camera(id)?;
-        match self.registry.get(id) {
-            Some(camera) => Ok(camera),
-            None => self.registry.refresh_camera(&self.store, id).await,
-        }
+        self.registry.active_camera(&self.store, self.caller(), id).await
     }
 }
 

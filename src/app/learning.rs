@@ -151,14 +151,14 @@ impl App {
     /// Stores samples of matched boxes and starts a training run on them.
     ///
     /// # Errors
-    /// As an import of samples, and as [`App::start_run`].
+    /// As an import of samples, and as [`Training::start`](super::Training::start).
     pub async fn train_on_matched(
         &self,
         id: &CameraId,
         samples: Vec<StoredSample>,
     ) -> Result<TrainingRun<CameraId>> {
         self.store_paired(id, samples, ImportOptions::default()).await?;
-        self.start_run(id, RunRequest::default(), None).await
+        self.training().start(id, RunRequest::default(), None).await
     }
 
     /// Reads what an earlier run of the server, or another node, has recorded.

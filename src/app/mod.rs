@@ -27,6 +27,7 @@ mod recording;
 mod registry;
 mod retention;
 mod samples;
+mod sessions;
 mod site_registry;
 mod site_training;
 mod sites;
@@ -49,14 +50,16 @@ use crate::store::{Location, Store, StoreLimits};
 use crate::telemetry::Metrics;
 
 pub use camera_statuses::CameraStatus;
+pub use cameras::Cameras;
 pub use cluster::{CameraLease, Cluster, ConnectionLease, DatabaseHistory, NodeSettings, NodeStatus, Watch};
 pub use connections::{
     ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, CountedReason,
     LastMessage, LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
 };
 pub use demonstration::{Demonstration, DemonstrationParts};
-pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest};
+pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest, Evaluations};
 pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
+pub use keys::Keys;
 pub use learning::{Learning, LearningState};
 pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
@@ -65,16 +68,18 @@ pub use live::{
     TrackPoint, UnplacedBox, WantedPositions, WorldSighting, WorldTrackPoint,
 };
 pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
-pub use models::GnssErrorEstimate;
+pub use models::{GnssErrorEstimate, Models};
 pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
 pub use retention::{ClockDoubt, Retention, retention_doubt};
 pub use samples::{ImportOptions, ImportReport, RejectedRow};
+pub use sessions::Sessions;
 pub use site_registry::{ActiveSite, SiteRegistry};
 pub use site_training::SiteRunRequest;
+pub use sites::Sites;
 pub use spool::{Content, Spool, SpoolLeases, Spooled};
-pub use training::{RunRequest, Trainable};
+pub use training::{RunRequest, Trainable, Training, TrainingQueues};
 
 /// The application: everything a request needs, on behalf of its caller. Cheap to clone.
 #[derive(Clone)]
@@ -114,9 +119,7 @@ pub struct Parts {
     /// Places for recordings that are paired in memory.
     pub pairings: Arc<Semaphore>,
     /// Notifies workers of queued training runs.
-    pub training_queue: JobQueue,
-    /// Notifies workers of queued training runs of sites.
-    pub site_training_queue: JobQueue,
+    pub training_queues: TrainingQueues,
     /// Notifies workers of queued evaluations.
     pub evaluation_queue: JobQueue,
     /// When the snapshot addresses of cameras were asked last.
@@ -176,8 +179,7 @@ impl App {
             quotas,
             metrics,
             pairings,
-            training_queue: JobQueue::default(),
-            site_training_queue: JobQueue::default(),
+            training_queues: TrainingQueues::default(),
             evaluation_queue: JobQueue::default(),
             snapshot_times: pictures::SnapshotTimes::default(),
             demonstration: Demonstration::default(),

@@ -3,12 +3,15 @@
 use bytes::Bytes;
 use jiff::Timestamp;
 
-use super::registry::{ModelFault, load_model, unusable};
+use super::access::Caller;
+use super::registry::{ModelFault, Registry, load_model, unusable};
 use super::{App, Page, page_of};
+use crate::clock::Clock;
 use crate::domain::{Camera, CameraId, Error, ErrorKind, ModelFormat, ModelVersion, Result};
 use crate::exchange::{RowError, TimedFix};
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::model::Artifact;
+use crate::store::Store;
 
 /// Fewest fixes from which the error is estimated.
 const FEWEST_FIXES: u64 = 10;
@@ -188,12 +191,29 @@ fn seconds(from: Timestamp, to: Timestamp) -> f64 {
     to.duration_since(from).as_secs_f64()
 }
 
+/// The use cases of model versions.
+#[derive(Clone, Copy)]
+pub struct Models<'a> {
+    store: &'a Store,
+    registry: &'a Registry,
+    clock: &'a Clock,
+    caller: &'a Caller,
+}
+
 impl App {
+    /// The use cases of model versions.
+    #[must_use]
+    pub fn models(&self) -> Models<'_> {
+        Models { store: &self.store, registry: &self.registry, clock: &self.clock, caller: &self.caller }
+    }
+}
+
+impl Models<'_> {
     /// One version, without its weights.
     ///
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`.
-    pub async fn model(&self, id: &CameraId, number: u32) -> Result<ModelVersion> {
+    pub async fn get(&self, id: &CameraId, number: u32) -> Result<ModelVersion> {
         self.store.model(id, number).await
     }
 
@@ -201,7 +221,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn models(
+    pub async fn list(
         &self,
         id: &CameraId,
         before: Option<u32>,
@@ -215,7 +235,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`, `ModelUnusable`.
-    pub async fn download_model(&self, id: &CameraId, number: u32, format: ModelFormat) -> Result<Bytes> {
+    pub async fn download(&self, id: &CameraId, number: u32, format: ModelFormat) -> Result<Bytes> {
         let (metadata, weights) = self.store.model_content(id, number).await?;
         let artifact = Artifact { metadata, weights: weights.into() };
         match format {
@@ -224,14 +244,14 @@ impl App {
         }
     }
 
-    /// Stores a version from a file that [`App::download_model`] gave, here or on another server.
+    /// Stores a version from a file that [`Models::download`] gave, here or on another server.
     /// It does not become active by itself.
     ///
     /// # Errors
     /// `CameraNotFound`; `InvalidArgument` naming what in the file cannot be used, or the check that its
     /// answers do not pass.
-    pub async fn import_model(&self, id: &CameraId, file: &[u8]) -> Result<ModelVersion> {
-        self.active_camera(id).await?;
+    pub async fn import(&self, id: &CameraId, file: &[u8]) -> Result<ModelVersion> {
+        self.registry.active_camera(self.store, self.caller, id).await?;
         let artifact = Artifact::from_file(file)?;
         artifact.load()?;
         self.store.insert_model(id, &artifact.metadata, &artifact.weights, self.clock.now()).await
@@ -241,7 +261,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`, `ModelActive`.
-    pub async fn delete_model(&self, id: &CameraId, number: u32) -> Result<()> {
+    pub async fn delete(&self, id: &CameraId, number: u32) -> Result<()> {
         self.store.delete_model(id, number, self.clock.now()).await
     }
 
@@ -249,10 +269,10 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`; `ModelUnusable` if the stored version cannot be loaded.
-    pub async fn activate_model(&self, id: &CameraId, number: u32) -> Result<Camera> {
+    pub async fn activate(&self, id: &CameraId, number: u32) -> Result<Camera> {
         load_model(id, number, self.store.model_content(id, number).await?)?;
         let camera = self.store.activate_model(id, number, self.clock.now()).await?;
-        self.registry.refresh_camera(&self.store, id).await?;
+        self.registry.refresh_camera(self.store, id).await?;
         Ok(camera)
     }
 
@@ -260,15 +280,15 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`; `NoModel` if none is active, `NoEarlierModel` if none was before it.
-    pub async fn roll_back_model(&self, id: &CameraId) -> Result<Camera> {
+    pub async fn roll_back(&self, id: &CameraId) -> Result<Camera> {
         let camera = self.store.roll_back(id, self.clock.now()).await?;
-        self.registry.refresh_camera(&self.store, id).await?;
+        self.registry.refresh_camera(self.store, id).await?;
         Ok(camera)
     }
 
     /// Why the camera's active version cannot be used, if so; it then answers by its fixes alone.
     #[must_use]
-    pub fn model_fault(&self, id: &CameraId) -> Option<ModelFault> {
+    pub fn fault(&self, id: &CameraId) -> Option<ModelFault> {
         self.registry.get(id)?.model_fault.clone()
     }
 
@@ -276,7 +296,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`; `NoModel`.
-    pub async fn active_model(&self, id: &CameraId) -> Result<ModelVersion> {
+    pub async fn active(&self, id: &CameraId) -> Result<ModelVersion> {
         let number =
             self.store.camera(id).await?.active_model.ok_or_else(|| {
                 Error::refused(ErrorKind::NoModel, format!("camera {id} has no active model"))

@@ -11,6 +11,7 @@ use arc_swap::ArcSwap;
 use jiff::Timestamp;
 use tokio::sync::Mutex;
 
+use super::access::Caller;
 use super::live::camera::CameraLive;
 use crate::domain::{
     CameraId, CameraKey, CameraMoved, Error, ErrorKind, GnssError, HeldOutError, ImageSize, ModelMetadata,
@@ -142,6 +143,23 @@ impl Registry {
         self.cameras.load().values().find(|camera| rule(camera)).cloned()
     }
 
+    /// The active camera of an id; looks into the store for one that another process has made.
+    ///
+    /// # Errors
+    /// `PermissionDenied` if the caller is a device of other cameras; `CameraNotFound`; a fault of the store.
+    pub(super) async fn active_camera(
+        &self,
+        store: &Store,
+        caller: &Caller,
+        id: &CameraId,
+    ) -> Result<Arc<ActiveCamera>> {
+        caller.authorize_camera(id)?;
+        match self.get(id) {
+            Some(camera) => Ok(camera),
+            None => self.refresh_camera(store, id).await,
+        }
+    }
+
     /// Brings one camera up to date with the store.
     ///
     /// # Errors
@@ -264,13 +282,26 @@ impl Registry {
         if known.live.continue_under(fence) {
             return false;
         }
+        self.clear(&known, fence);
+        true
+    }
+
+    /// Clears a camera's live state if another node has owned the camera since; the camera if it was cleared.
+    pub(super) async fn clear_before(&self, key: CameraKey, fence: i64) -> Option<Arc<ActiveCamera>> {
+        let _change = self.change.lock().await;
+        let former = self.find(|camera| camera.key == key && camera.live.is_before(fence))?;
+        self.clear(&former, fence);
+        Some(former)
+    }
+
+    /// Gives a camera a new live state, under a fence.
+    fn clear(&self, known: &ActiveCamera, fence: i64) {
         known.live.replace();
         let tenure = fence.cast_unsigned().rotate_right(16);
-        let live = CameraLive::new(self.event_log(key).wrapping_add(tenure));
+        let live = CameraLive::new(self.event_log(known.key).wrapping_add(tenure));
         live.continue_under(fence);
-        let cleared = Arc::new(ActiveCamera { live, ..ActiveCamera::clone(&known) });
-        self.replace(|cameras| cameras.insert(id.clone(), cleared.clone()));
-        true
+        let cleared = Arc::new(ActiveCamera { live, ..known.clone() });
+        self.replace(|cameras| cameras.insert(known.id.clone(), cleared.clone()));
     }
 
     /// Removes a deleted camera and ends what listens to it. Waits for a refresh under way, which may

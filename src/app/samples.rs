@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::mpsc;
 
 use super::access::Permission;
-use super::idempotency::record_of;
+use super::idempotency::{first_answer, record_of, stored_answer};
 use super::swapped_columns::PlaceCheck;
 use super::{App, Page, page_of};
 use crate::domain::{
@@ -132,7 +132,7 @@ impl App {
         self.active_camera(id).await?;
         let mut batches = std::pin::pin!(rows.ready_chunks(BATCH_ROWS));
         if let Some(request) = &options.idempotent
-            && self.stored_answer(request).await?.is_some()
+            && stored_answer(&self.store, &self.clock, request).await?.is_some()
         {
             // The request is known once all of it has come.
             while let Some(chunk) = batches.next().await {
@@ -169,7 +169,7 @@ impl App {
     /// `IdempotencyKeyReused` if that was another one.
     pub(super) async fn repeated_import(&self, options: &ImportOptions) -> Result<Option<ImportReport>> {
         let Some(request) = &options.idempotent else { return Ok(None) };
-        let first = self.first_answer(request).await?;
+        let first = first_answer(&self.store, &self.clock, request).await?;
         first.map(|report| serde_json::from_str(&report).map_err(Error::fault)).transpose()
     }
 

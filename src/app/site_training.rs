@@ -2,8 +2,8 @@
 
 use jiff::Timestamp;
 
-use super::training::{Trainable, check_extent};
-use super::{App, JobQueue};
+use super::JobQueue;
+use super::training::{Trainable, Training, TrainingQueues, check_extent};
 use crate::domain::{Camera, Error, ErrorKind, Result, SiteId, SiteTrainingOptions, TimeRange};
 use crate::store::SampleFilter;
 
@@ -24,27 +24,31 @@ pub struct SiteRunRequest {
 impl Trainable for SiteId {
     type RunRequest = SiteRunRequest;
 
-    async fn run_options(&self, app: &App, request: SiteRunRequest) -> Result<SiteTrainingOptions> {
+    async fn run_options(
+        &self,
+        training: &Training<'_>,
+        request: SiteRunRequest,
+    ) -> Result<SiteTrainingOptions> {
         let SiteRunRequest { seed, from, until } = request;
         let filter = SampleFilter::within(TimeRange::new(from, until)?);
-        for camera in app.cameras_to_train(self).await? {
-            let (count, extent) = app.store.sample_extent(camera.id(), &filter).await?;
+        for camera in training.cameras_of(self).await? {
+            let (count, extent) = training.store.sample_extent(camera.id(), &filter).await?;
             check_extent(camera.id(), count, extent)?;
         }
         Ok(SiteTrainingOptions { seed: seed.unwrap_or(0), from, until })
     }
 
-    fn queue(app: &App) -> &JobQueue {
-        &app.site_training_queue
+    fn queue(queues: &TrainingQueues) -> &JobQueue {
+        &queues.sites
     }
 }
 
-impl App {
+impl Training<'_> {
     /// The cameras of a site in the order of their ids.
     ///
     /// # Errors
     /// `SiteNotFound`; `UnusableSamples` if there are too few or too many.
-    pub async fn cameras_to_train(&self, id: &SiteId) -> Result<Vec<Camera>> {
+    pub async fn cameras_of(&self, id: &SiteId) -> Result<Vec<Camera>> {
         let most = self.limits.cameras_per_site_run;
         self.store.site(id).await?;
         let cameras = self.store.cameras(Some(id), None, most + 1).await?;

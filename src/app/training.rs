@@ -5,15 +5,17 @@ use std::time::Duration;
 use futures_util::{Stream, StreamExt as _, stream};
 use jiff::Timestamp;
 
-use super::idempotency::record_of;
+use super::idempotency::{first_answer, record_of};
 use super::{App, JobQueue, Page, page_of};
+use crate::clock::{Clock, Randomness};
+use crate::config::Limits;
 use crate::domain::{
     CameraId, EpochReport, Error, ErrorKind, IdempotentRequest, Recipe, Result, RunId, TimeRange,
     TrainingOptions, TrainingRun,
 };
 use crate::geo::{Position, distance_m};
 use crate::model::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
-use crate::store::{RunSubject, SampleFilter};
+use crate::store::{RunSubject, SampleFilter, Store};
 
 /// How often a watched run is read from the store.
 const WATCH_INTERVAL: Duration = Duration::from_millis(200);
@@ -33,6 +35,15 @@ pub struct RunRequest {
     pub until: Option<Timestamp>,
 }
 
+/// Wakes the workers that train.
+#[derive(Default)]
+pub struct TrainingQueues {
+    /// Runs of cameras.
+    pub(super) cameras: JobQueue,
+    /// Runs of sites.
+    pub(super) sites: JobQueue,
+}
+
 /// A camera or a site, as clients ask for its training.
 pub trait Trainable: RunSubject {
     /// A request for a run.
@@ -41,25 +52,25 @@ pub trait Trainable: RunSubject {
     /// The parameters of a run, if the request is valid and the samples are usable.
     fn run_options(
         &self,
-        app: &App,
+        training: &Training<'_>,
         request: Self::RunRequest,
     ) -> impl Future<Output = Result<Self::Options>> + Send;
 
     /// Notifies the workers of its runs.
-    fn queue(app: &App) -> &JobQueue;
+    fn queue(queues: &TrainingQueues) -> &JobQueue;
 }
 
 impl Trainable for CameraId {
     type RunRequest = RunRequest;
 
-    async fn run_options(&self, app: &App, request: RunRequest) -> Result<TrainingOptions> {
-        let camera = app.store.camera(self).await?;
-        let most = app.limits.epochs;
+    async fn run_options(&self, training: &Training<'_>, request: RunRequest) -> Result<TrainingOptions> {
+        let camera = training.store.camera(self).await?;
+        let most = training.limits.epochs;
         if request.epochs.is_some_and(|epochs| !(1..=most).contains(&epochs)) {
             return Err(Error::invalid("epochs", format!("must be from 1 to {most}")));
         }
         let range = TimeRange::new(request.from, request.until)?;
-        let (count, extent) = app.store.sample_extent(self, &SampleFilter::within(range)).await?;
+        let (count, extent) = training.store.sample_extent(self, &SampleFilter::within(range)).await?;
         check_extent(self, count, extent)?;
         Ok(TrainingOptions {
             recipe: request.recipe.unwrap_or(camera.profile.recipe),
@@ -70,12 +81,36 @@ impl Trainable for CameraId {
         })
     }
 
-    fn queue(app: &App) -> &JobQueue {
-        &app.training_queue
+    fn queue(queues: &TrainingQueues) -> &JobQueue {
+        &queues.cameras
     }
 }
 
+/// The use cases of training runs of cameras and sites.
+#[derive(Clone, Copy)]
+pub struct Training<'a> {
+    pub(super) store: &'a Store,
+    clock: &'a Clock,
+    randomness: &'a Randomness,
+    pub(super) limits: &'a Limits,
+    queues: &'a TrainingQueues,
+}
+
 impl App {
+    /// The use cases of training runs of cameras and sites.
+    #[must_use]
+    pub fn training(&self) -> Training<'_> {
+        Training {
+            store: &self.store,
+            clock: &self.clock,
+            randomness: &self.randomness,
+            limits: &self.limits,
+            queues: &self.training_queues,
+        }
+    }
+}
+
+impl Training<'_> {
     /// Queues a training run of a camera, or over all cameras of a site. If the client has made the same request
     /// before, it gets the run of then as it is now.
     ///
@@ -83,16 +118,16 @@ impl App {
     /// `CameraNotFound` or `SiteNotFound`; `InvalidArgument` naming the field; `UnusableSamples` if there are too few, or
     /// the site has too few or too many cameras; `RunLive`; `Overloaded` beyond the limit of live runs;
     /// `IdempotencyKeyReused`; `RunNotFound` if the run of the first request was deleted since.
-    pub async fn start_run<S: Trainable>(
+    pub async fn start<S: Trainable>(
         &self,
         subject: &S,
         request: S::RunRequest,
         idempotent: Option<IdempotentRequest>,
     ) -> Result<TrainingRun<S>> {
         if let Some(request) = &idempotent
-            && let Some(first) = self.first_answer(request).await?
+            && let Some(first) = first_answer(self.store, self.clock, request).await?
         {
-            return self.run(subject, first.parse()?).await;
+            return self.get(subject, first.parse()?).await;
         }
         let options = subject.run_options(self, request).await?;
         let now = self.clock.now();
@@ -100,7 +135,7 @@ impl App {
         let record = idempotent.as_ref().map(record_of);
         let most = self.limits.live_runs;
         let run = self.store.insert_run(run, subject, &options, most, record.as_ref(), now).await?;
-        S::queue(self).notify();
+        S::queue(self.queues).notify();
         Ok(run)
     }
 
@@ -108,7 +143,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound` or `SiteNotFound`; `RunNotFound`.
-    pub async fn run<S: RunSubject>(&self, subject: &S, run: RunId) -> Result<TrainingRun<S>> {
+    pub async fn get<S: RunSubject>(&self, subject: &S, run: RunId) -> Result<TrainingRun<S>> {
         self.store.run(subject, run).await
     }
 
@@ -116,7 +151,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound` or `SiteNotFound`.
-    pub async fn runs<S: RunSubject>(
+    pub async fn list<S: RunSubject>(
         &self,
         subject: &S,
         before: Option<RunId>,
@@ -130,7 +165,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound` or `SiteNotFound`; `RunNotFound`, `RunEnded`.
-    pub async fn cancel_run<S: RunSubject>(&self, subject: &S, run: RunId) -> Result<TrainingRun<S>> {
+    pub async fn cancel<S: RunSubject>(&self, subject: &S, run: RunId) -> Result<TrainingRun<S>> {
         self.store.cancel_run(subject, run, self.clock.now()).await
     }
 
@@ -138,7 +173,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`, `RunNotFound`, `RunLive`.
-    pub async fn delete_run(&self, id: &CameraId, run: RunId) -> Result<()> {
+    pub async fn delete(&self, id: &CameraId, run: RunId) -> Result<()> {
         self.store.delete_run(id, run, self.clock.now()).await
     }
 
@@ -146,7 +181,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`, `RunNotFound`.
-    pub async fn run_epochs(&self, id: &CameraId, run: RunId) -> Result<Vec<EpochReport>> {
+    pub async fn epochs(&self, id: &CameraId, run: RunId) -> Result<Vec<EpochReport>> {
         self.store.run(id, run).await?;
         self.store.epochs(run).await
     }
@@ -155,7 +190,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`, `RunNotFound`.
-    pub async fn run_log(&self, id: &CameraId, run: RunId) -> Result<Vec<(Timestamp, String)>> {
+    pub async fn log(&self, id: &CameraId, run: RunId) -> Result<Vec<(Timestamp, String)>> {
         self.store.run(id, run).await?;
         self.store.log(run).await
     }
@@ -165,7 +200,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound` or `SiteNotFound`; `RunNotFound` at once; a fault later ends the stream.
-    pub async fn watch_run<S: RunSubject>(
+    pub async fn watch<S: RunSubject>(
         &self,
         subject: &S,
         run: RunId,

@@ -15,7 +15,7 @@ use crate::evaluation::site::{
 pub(super) struct Draws {
     pub(super) count: u64,
     pub(super) first_seed: u64,
-    /// Whether only the errors of the fixes are drawn.
+    /// True if only the errors of the fixes are drawn.
     pub(super) only_errors: bool,
 }
 

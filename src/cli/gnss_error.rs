@@ -17,11 +17,11 @@ use crate::exchange::{self, FixFormat};
 /// Estimate a receiver's error from many fixes at one fixed point
 #[derive(Args)]
 pub(super) struct EstimateGnssError {
-    /// Fixes as CSV (longitude, latitude), NMEA (GGA), GPX, gpsd reports or solutions of RTKLIB (.pos), by file
-    /// extension, which may be followed by .gz or .zst; - is standard input
+    /// Fixes as CSV (longitude, latitude), NMEA, GPX, gpsd reports, solutions of RTKLIB (.pos), FIT or a log of
+    /// GnssLogger, by file extension, which may be followed by .gz or .zst; - is standard input
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Format if the ending does not name it: csv, nmea, gpx, gpsd or rtklib [default: csv for -]
+    /// Format if the ending does not name it: csv, nmea, gpx, gpsd, rtklib, fit or gnss_logger [default: csv for -]
     #[arg(long, value_name = "FORMAT")]
     format: Option<FixFormat>,
     #[command(flatten)]
@@ -31,7 +31,7 @@ pub(super) struct EstimateGnssError {
 impl EstimateGnssError {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let format = files::fix_format_of(&self.file, self.format).context(
-            "the extension must be .csv, .nmea, .log, .txt, .gpx, .json or .pos; or give --format",
+            "the extension must be .csv, .nmea, .log, .txt, .gpx, .json, .pos or .fit; or give --format",
         )?;
         let time_bounds = TimeBounds::at(Clock::system().now());
         let rows = exchange::read_fixes(files::open_input(&self.file)?, format, time_bounds)?;

@@ -108,7 +108,7 @@ impl Import {
     /// Creates the camera and its site, as far as they do not exist.
     async fn create_camera(&self, app: &App) -> anyhow::Result<()> {
         if let Some(site) = &self.site {
-            match app.create_site(NewSite::named(site.clone())).await {
+            match app.sites().create(NewSite::named(site.clone())).await {
                 Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::SiteExists => {}
                 created => drop(created?),
             }
@@ -120,7 +120,7 @@ impl Import {
             site: self.site.clone(),
             ..NewCamera::named(self.camera.clone())
         };
-        match app.create_camera(profile).await {
+        match app.cameras().create(profile).await {
             Err(Error::Refused(refusal)) if refusal.kind == ErrorKind::CameraExists => {
                 self.check_profile(app).await
             }
@@ -131,7 +131,7 @@ impl Import {
 
     /// Boxes of another image, or of a camera elsewhere, would be stored as if they were of this one.
     async fn check_profile(&self, app: &App) -> anyhow::Result<()> {
-        let profile = app.camera(&self.camera).await?.profile;
+        let profile = app.cameras().get(&self.camera).await?.profile;
         anyhow::ensure!(
             self.site.is_none() || profile.site == self.site,
             "camera {} exists and belongs to {}; leave --site out, or change the profile",

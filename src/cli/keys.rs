@@ -93,7 +93,7 @@ impl Create {
         let key = NewKey::new(&self.name, scope, expires_at, now)?;
         runtime()?.block_on(async {
             let app = open_app(&settings, "sightfix keys", MissingData::Create).await?;
-            let created = app.create_key(&key).await;
+            let created = app.keys().create(&key).await;
             app.close().await;
             let (key, secret) = created?;
             print_note(format_args!("key {} for {}; its secret is not shown again:", key.id, key.name));
@@ -125,7 +125,7 @@ async fn print_all(app: &App) -> anyhow::Result<()> {
     let now = app.clock.now();
     let mut before = None;
     loop {
-        let page = app.keys(before, PAGE_ITEMS).await?;
+        let page = app.keys().list(before, PAGE_ITEMS).await?;
         for key in page.items {
             print_line(&line_of(&key, now))?;
         }
@@ -157,7 +157,7 @@ impl Revoke {
         let settings = self.folder.settings(file)?;
         runtime()?.block_on(async {
             let app = open_app(&settings, "sightfix keys", MissingData::Refuse).await?;
-            let revoked = app.revoke_key(self.key).await;
+            let revoked = app.keys().revoke(self.key).await;
             app.close().await;
             let revoked_at = revoked?.revoked_at.context("the key was not revoked")?;
             print_line(&format_args!("revoked {revoked_at:.0}"))

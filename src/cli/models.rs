@@ -78,9 +78,9 @@ impl Export {
             let content = async {
                 let number = match self.number {
                     Some(number) => number,
-                    None => app.active_model(camera).await?.number,
+                    None => app.models().active(camera).await?.number,
                 };
-                app.download_model(camera, number, format).await
+                app.models().download(camera, number, format).await
             }
             .await;
             app.close().await;

@@ -21,7 +21,7 @@ pub(super) fn is_quiet() -> bool {
     QUIET.load(Ordering::Relaxed)
 }
 
-/// True if the reader of standard output has gone, as in `sightfix openapi | head -1`: it wants no more, and a
+/// True if the reader of standard output has gone, as in `sightfix openapi | head -1`: it wants nothing further, and a
 /// command that ends early for it has not failed.
 #[must_use]
 pub fn reader_is_gone() -> bool {
@@ -51,7 +51,7 @@ impl Write for StandardOutput {
 }
 
 /// Prints a text and a line break on standard output; unlike `println!` it does not panic. A reader that has
-/// gone, as in `sightfix openapi | head -1`, wants no more: the rest is dropped.
+/// gone, as in `sightfix openapi | head -1`, wants nothing further: the rest is dropped.
 ///
 /// # Errors
 /// The output cannot be written for another reason, such as a full device.

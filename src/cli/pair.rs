@@ -50,12 +50,11 @@ pub(super) struct Pair {
     /// Time of the first frame of such a file, such as 2026-06-01T12:00:00Z
     #[arg(long, value_name = "TIME", value_parser = parse_time, requires = "detections_format")]
     start_time: Option<Timestamp>,
-    /// Fixes as CSV, NMEA, GPX, gpsd reports (.json) or solutions of RTKLIB (.pos), by file extension, which may be
-    /// followed by .gz or .zst; - is standard
-    /// input
+    /// Fixes as CSV, NMEA, GPX, gpsd reports (.json), solutions of RTKLIB (.pos), FIT or a log of GnssLogger, by file
+    /// extension, which may be followed by .gz or .zst; - is standard input
     #[arg(long, value_name = "FILE")]
     fixes: PathBuf,
-    /// Format of the fixes if the extension does not determine it: csv, nmea, gpx, gpsd or rtklib
+    /// Format of the fixes if the extension does not determine it: csv, nmea, gpx, gpsd, rtklib, fit or gnss_logger
     #[arg(long, value_name = "FORMAT")]
     fixes_format: Option<FixFormat>,
     /// Output file for `sightfix import`: CSV, NDJSON or JSON, by file extension, which may be followed by .gz or
@@ -232,7 +231,7 @@ impl Pair {
         anyhow::ensure!(!both, "only one of --detections and --fixes can be standard input");
         let format = files::fix_format_of(&self.fixes, self.fixes_format).with_context(|| {
             let name = self.fixes.display();
-            format!("{name}: the extension does not determine the format; give --fixes-format csv, nmea, gpx, gpsd or rtklib")
+            format!("{name}: the extension does not determine the format; give --fixes-format csv, nmea, gpx, gpsd, rtklib, fit or gnss_logger")
         })?;
         if let Some(out) = &self.out {
             files::format_of(out, None)?; // fail early
@@ -370,7 +369,7 @@ fn print_match(summary: &Summary, report: &MatchReport) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What was matched, in the names of the answer over REST, and the scores of the search without a model.
+/// The matched rows, in the names of the answer over REST, and the scores of the search without a model.
 fn match_document(report: &MatchReport) -> serde_json::Value {
     let pair = |pair: &MatchedPair| {
         serde_json::json!({

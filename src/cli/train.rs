@@ -99,10 +99,10 @@ async fn train<S: Trainable, W: Future<Output = ()> + Send + 'static>(
     (subject, request): (&S, S::RunRequest),
     work: impl FnOnce(App, Workers, Shutdown) -> W,
 ) -> anyhow::Result<TrainingRun<S>> {
-    let queued = app.start_run(subject, request, None).await?;
+    let queued = app.training().start(subject, request, None).await?;
     let shutdown = Shutdown::new();
     shutdown.spawn(work(app.clone(), settings.training.clone(), shutdown.clone()));
-    let changes = app.watch_run(subject, queued.id).await?;
+    let changes = app.training().watch(subject, queued.id).await?;
     let latest = watched(queued, changes).await?;
     shutdown.drain_with_timeout(settings.limits.drain_time()).await;
     Ok(latest)

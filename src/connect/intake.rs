@@ -116,6 +116,8 @@ pub(super) struct Intake {
     live: Arc<LiveConnection>,
     routing: Routing,
     durability: Option<Durability>,
+    /// True if a message is acknowledged when all that was to be stored of it is stored.
+    awaits_storage: bool,
     decoder: Box<dyn MessageDecoder>,
     streams: HashMap<CameraId, CameraStream>,
     pending: VecDeque<PendingMessage>,
@@ -136,6 +138,7 @@ impl Intake {
             live,
             routing: Routing::of(settings)?,
             durability: settings.store_samples.then_some(Durability::Synced),
+            awaits_storage: settings.store_samples && !settings.answers_at_once(),
             decoder: source_decoder(settings),
             streams: HashMap::new(),
             pending: VecDeque::new(),
@@ -162,7 +165,7 @@ impl Intake {
         let mut items = Vec::new();
         let outcome = match read {
             Ok(Reading { items: read, skipped }) => {
-                account.skip_all(skipped);
+                account.skip_all(skipped, &example_of(&message));
                 for item in read {
                     self.take_item(item, &mut items, &mut account).await?;
                 }
@@ -204,7 +207,7 @@ impl Intake {
             match self.follow(&camera, source).await {
                 Ok(seq) => {
                     account.took(&camera, &description, time);
-                    if self.durability.is_some() {
+                    if self.awaits_storage {
                         items.push((camera, seq));
                     }
                 }
@@ -263,6 +266,9 @@ impl Intake {
     /// Samples could not be stored: nothing after them is acknowledged.
     pub(super) fn settled(&mut self) -> Result<Vec<Settled>> {
         let mut settled = Vec::new();
+        for known in self.streams.values() {
+            known.stream.acknowledgement()?;
+        }
         while let Some(message) = self.pending.front() {
             for (camera, seq) in &message.items {
                 if let Some(known) = self.streams.get(camera)
@@ -394,6 +400,12 @@ const EMPTY_READING: &str = "the message contains no detection and no fix";
 /// Bytes of a message that was not taken which are kept as an example.
 const EXAMPLE_BYTES: usize = 200;
 
+/// The beginning of a message, as text.
+fn example_of(message: &Message) -> String {
+    let shown = &message.payload[..message.payload.len().min(EXAMPLE_BYTES)];
+    String::from_utf8_lossy(shown).into_owned()
+}
+
 /// The counts of the items of one message.
 #[derive(Default)]
 struct Account {
@@ -429,11 +441,11 @@ impl Account {
         Ok(())
     }
 
-    fn skip_all(&mut self, reasons: Vec<String>) {
+    fn skip_all(&mut self, reasons: Vec<String>, example: &str) {
         self.skipped += reasons.len() as u64;
         for reason in reasons {
             self.line(format!("skipped: {reason}"));
-            self.reasons.push((reason.clone(), reason));
+            self.reasons.push((reason, example.to_owned()));
         }
     }
 
@@ -442,8 +454,7 @@ impl Account {
         let untaken = outcome.as_ref().err().map(|reason| format!("rejected: {reason}"));
         let untaken = untaken.or_else(|| is_empty.then(|| EMPTY_READING.to_owned()));
         if let Some(reason) = untaken {
-            let shown = &message.payload[..message.payload.len().min(EXAMPLE_BYTES)];
-            self.reasons.push((reason.clone(), String::from_utf8_lossy(shown).into_owned()));
+            self.reasons.push((reason.clone(), example_of(message)));
             self.line(reason);
         }
         let lag = self.latest.map(|latest| self.now.duration_since(latest).as_secs_f64());

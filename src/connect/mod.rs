@@ -27,6 +27,7 @@ mod open;
 mod peer;
 mod publish;
 mod push;
+mod rtsp;
 mod serial;
 mod sink;
 mod snapshot;

@@ -6,7 +6,7 @@ use super::credentials::{Credentials, PeerError};
 use super::file::{FileSettings, FileSink};
 use super::sink::Sink;
 use super::source::{Source, SourceIdentity};
-use super::{kafka, lines, listener, mqtt, nats, push, stream, udp, webhook};
+use super::{kafka, lines, listener, mqtt, nats, push, rtsp, stream, udp, webhook};
 use crate::app::{App, LiveConnection};
 use crate::domain::{Connection, ConnectionId};
 use crate::exchange::{OutgoingFormat, Scheme, Secrets, SinkSettings, SourceSettings};
@@ -48,6 +48,9 @@ pub(super) async fn source(
         }
         Scheme::Tcp | Scheme::Tls | Scheme::Gpsd => {
             Box::new(lines::LineSource::connect(&address, &credentials, message_bytes, live).await?)
+        }
+        Scheme::Rtsp | Scheme::Rtsps => {
+            Box::new(rtsp::RtspSource::open(&address, &credentials, message_bytes, live).await?)
         }
         Scheme::TcpListen => Box::new(listener::LineListener::bind(&address, app, live).await?),
         Scheme::Udp => Box::new(udp::UdpSource::bind(&address).await?),
@@ -98,7 +101,7 @@ pub(super) async fn sink(
         Scheme::Tcp | Scheme::Tls => Box::new(stream::StreamSink::open(&address, &credentials).await?),
         Scheme::Udp => Box::new(udp::UdpSink::open(&address, settings.multicast_ttl.unwrap_or(1)).await?),
         Scheme::File => Box::new(file_sink(app, connection, settings).await?),
-        Scheme::TcpListen | Scheme::Gpsd | Scheme::Serial | Scheme::Push => {
+        Scheme::TcpListen | Scheme::Gpsd | Scheme::Rtsp | Scheme::Rtsps | Scheme::Serial | Scheme::Push => {
             return Err("a sink cannot have this address".into());
         }
     })

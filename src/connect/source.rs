@@ -26,7 +26,7 @@ impl Message {
         Self { receipt, subject, payload, size_bytes, unread: None }
     }
 
-    /// The whole content, of at most so many bytes.
+    /// The whole content, if it has at most `most_bytes`.
     ///
     /// # Errors
     /// Why there is none.

@@ -33,7 +33,7 @@ impl CameraService for Cameras {
             let profile = new_camera(id, asked.profile.unwrap_or_default())
                 .and_then(NewCamera::check)
                 .map_err(|error| error.under("profile"))?;
-            let camera = app.create_camera(profile).await.map_err(|error| of_field(error, "profile"))?;
+            let camera = app.cameras().create(profile).await.map_err(|error| of_field(error, "profile"))?;
             Ok(proto::CreateCameraResponse { camera: Some(proto::Camera::of(&app, camera)) })
         })
         .await
@@ -44,7 +44,7 @@ impl CameraService for Cameras {
         request: tonic::Request<proto::GetCameraRequest>,
     ) -> Reply<proto::GetCameraResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let camera = app.camera(&camera_id(&asked.camera_id)?).await?;
+            let camera = app.cameras().get(&camera_id(&asked.camera_id)?).await?;
             Ok(proto::GetCameraResponse { camera: Some(proto::Camera::of(&app, camera)) })
         })
         .await
@@ -58,7 +58,7 @@ impl CameraService for Cameras {
             let size = pages::size(asked.page_size, &app.limits)?;
             let after = pages::cursor::<CameraId>(&asked.page_token)?;
             let site = Some(&asked.site_id).filter(|id| !id.is_empty()).map(|id| site_id(id)).transpose()?;
-            let page = app.cameras(site.as_ref(), after.as_ref(), size).await?;
+            let page = app.cameras().list(site.as_ref(), after.as_ref(), size).await?;
             Ok(proto::ListCamerasResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 cameras: page.items.into_iter().map(|camera| proto::Camera::of(&app, camera)).collect(),
@@ -75,7 +75,7 @@ impl CameraService for Cameras {
             let id = camera_id(&asked.camera_id)?;
             let expected = asked.expected_revision.map(|revision| Revision(revision).into());
             let change = camera_change(&id, required(asked.profile, "profile")?, asked.update_mask)?;
-            let changed = app.change_camera(&id, change, expected).await;
+            let changed = app.cameras().change(&id, change, expected).await;
             let camera = changed.map_err(|error| of_field(error, "profile"))?;
             Ok(proto::UpdateCameraResponse { camera: Some(proto::Camera::of(&app, camera)) })
         })
@@ -88,7 +88,9 @@ impl CameraService for Cameras {
     ) -> Reply<proto::DeleteCameraResponse> {
         answer(&self.app, request, |app, asked| async move {
             let id = camera_id(&asked.camera_id)?;
-            app.delete_camera(&id, asked.expected_revision.map(|revision| Revision(revision).into())).await?;
+            app.cameras()
+                .delete(&id, asked.expected_revision.map(|revision| Revision(revision).into()))
+                .await?;
             Ok(proto::DeleteCameraResponse {})
         })
         .await
@@ -213,9 +215,9 @@ impl proto::Camera {
     fn of(app: &App, camera: Camera) -> Self {
         Self {
             moved: app.camera_moved(camera.id()).map(|moved| (*moved).clone().into()),
-            model_fault: app.model_fault(camera.id()).map(|fault| fault.reason),
+            model_fault: app.models().fault(camera.id()).map(|fault| fault.reason),
             id: camera.id().as_str().to_owned(),
-            warnings: app.camera_warnings(&camera),
+            warnings: app.cameras().warnings(&camera),
             profile: Some(camera.profile.into()),
             revision: camera.revision.0,
             created_at: Some(timestamp(camera.created_at)),

@@ -171,7 +171,7 @@ impl Connection {
     }
 }
 
-/// The client's half of a stream. Dropping it half-closes: no more items, the answers still come.
+/// The client's half of a stream. Dropping it half-closes: it sends no further items, and answers still come.
 #[derive(Debug)]
 pub struct ItemSender(mpsc::Sender<proto::StreamRequest>);
 
@@ -182,7 +182,7 @@ impl ItemSender {
     /// The stream has ended; the [`Events`] say why.
     pub async fn reserve(&self) -> Result<SendPermit<'_>, ClientError> {
         let permit = self.0.reserve().await;
-        permit.map(SendPermit).map_err(|_| ClientError::broken_line("the stream takes no more items"))
+        permit.map(SendPermit).map_err(|_| ClientError::broken_line("the stream accepts no further items"))
     }
 }
 

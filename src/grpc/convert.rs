@@ -43,15 +43,14 @@ pub(super) fn run_id(id: &str) -> Result<RunId> {
     required_text(id, "run_id")?.parse()
 }
 
+/// Prefix of the recipes' names in `values.proto`; the rest is the name of the recipe in capitals.
+const RECIPE: &str = "RECIPE_";
+
 /// The recipe, if it is not left open.
 pub(super) fn recipe(recipe: i32) -> Result<Option<domain::Recipe>> {
     match proto::Recipe::try_from(recipe) {
         Ok(proto::Recipe::Unspecified) => Ok(None),
-        Ok(proto::Recipe::Paper) => Ok(Some(domain::Recipe::Paper)),
-        Ok(proto::Recipe::Hybrid) => Ok(Some(domain::Recipe::Hybrid)),
-        Ok(proto::Recipe::Projective) => Ok(Some(domain::Recipe::Projective)),
-        Ok(proto::Recipe::GaussianProcess) => Ok(Some(domain::Recipe::GaussianProcess)),
-        Ok(proto::Recipe::Auto) => Ok(Some(domain::Recipe::Auto)),
+        Ok(recipe) => recipe.as_str_name().trim_start_matches(RECIPE).to_ascii_lowercase().parse().map(Some),
         Err(_) => Err(Error::invalid("recipe", format!("has no value {recipe}"))),
     }
 }
@@ -105,13 +104,8 @@ impl From<domain::Durability> for proto::Durability {
 
 impl From<domain::Recipe> for proto::Recipe {
     fn from(recipe: domain::Recipe) -> Self {
-        match recipe {
-            domain::Recipe::Paper => Self::Paper,
-            domain::Recipe::Hybrid => Self::Hybrid,
-            domain::Recipe::Projective => Self::Projective,
-            domain::Recipe::GaussianProcess => Self::GaussianProcess,
-            domain::Recipe::Auto => Self::Auto,
-        }
+        let name = format!("{RECIPE}{}", recipe.as_str().to_ascii_uppercase());
+        Self::from_str_name(&name).unwrap_or_default()
     }
 }
 
@@ -341,6 +335,18 @@ mod tests {
         assert_eq!(without(nanos), "time.nanos");
         let seconds = |sample: &mut proto::Sample| sample.time.as_mut().expect("set").seconds = i64::MAX;
         assert_eq!(without(seconds), "time.seconds");
+    }
+
+    #[test]
+    fn recipes_and_their_numbers_correspond() {
+        let numbers = domain::Recipe::ALL.iter().map(|own| proto::Recipe::from(*own) as i32);
+        let mut numbers: Vec<i32> = numbers.collect();
+        for (own, number) in domain::Recipe::ALL.iter().zip(&numbers) {
+            assert_eq!(recipe(*number).expect("has a name"), Some(*own));
+        }
+        numbers.sort_unstable();
+        let of_proto: Vec<i32> = (1..100).filter(|number| proto::Recipe::try_from(*number).is_ok()).collect();
+        assert_eq!(numbers, of_proto);
     }
 
     proptest! {

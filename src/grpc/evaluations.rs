@@ -29,7 +29,7 @@ impl EvaluationService for Evaluations {
     ) -> Reply<proto::StartEvaluationResponse> {
         answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
-            let job = app.start_evaluation(&camera, evaluation_request(asked)?).await?;
+            let job = app.evaluations().start(&camera, evaluation_request(asked)?).await?;
             Ok(proto::StartEvaluationResponse { evaluation: Some(job.into()) })
         })
         .await
@@ -40,7 +40,7 @@ impl EvaluationService for Evaluations {
         request: tonic::Request<proto::GetEvaluationRequest>,
     ) -> Reply<proto::GetEvaluationResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let (job, report_json) = app.evaluation(evaluation_id(&asked.evaluation_id)?).await?;
+            let (job, report_json) = app.evaluations().get(evaluation_id(&asked.evaluation_id)?).await?;
             let evaluation = proto::Evaluation { report_json, ..job.into() };
             Ok(proto::GetEvaluationResponse { evaluation: Some(evaluation) })
         })
@@ -56,7 +56,7 @@ impl EvaluationService for Evaluations {
             let camera = camera.map(camera_id).transpose()?;
             let size = pages::size(asked.page_size, &app.limits)?;
             let before = pages::cursor::<EvaluationId>(&asked.page_token)?;
-            let page = app.evaluations(camera.as_ref(), before, size).await?;
+            let page = app.evaluations().list(camera.as_ref(), before, size).await?;
             Ok(proto::ListEvaluationsResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 evaluations: page.items.into_iter().map(Into::into).collect(),
@@ -70,7 +70,7 @@ impl EvaluationService for Evaluations {
         request: tonic::Request<proto::CancelEvaluationRequest>,
     ) -> Reply<proto::CancelEvaluationResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let job = app.cancel_evaluation(evaluation_id(&asked.evaluation_id)?).await?;
+            let job = app.evaluations().cancel(evaluation_id(&asked.evaluation_id)?).await?;
             Ok(proto::CancelEvaluationResponse { evaluation: Some(job.into()) })
         })
         .await
@@ -81,7 +81,7 @@ impl EvaluationService for Evaluations {
         request: tonic::Request<proto::DeleteEvaluationRequest>,
     ) -> Reply<proto::DeleteEvaluationResponse> {
         answer(&self.app, request, |app, asked| async move {
-            app.delete_evaluation(evaluation_id(&asked.evaluation_id)?).await?;
+            app.evaluations().delete(evaluation_id(&asked.evaluation_id)?).await?;
             Ok(proto::DeleteEvaluationResponse {})
         })
         .await

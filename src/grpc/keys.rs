@@ -30,7 +30,7 @@ impl KeyService for Keys {
             let scope = Scope::new(role, convert_all("camera_ids", asked.camera_ids, camera)?)?;
             let expires_at = instant(asked.expires_at, "expires_at")?;
             let key = NewKey::new(&asked.name, scope, expires_at, app.clock.now())?;
-            let (key, secret) = app.create_key(&key).await?;
+            let (key, secret) = app.keys().create(&key).await?;
             Ok(proto::CreateKeyResponse { key: Some(key.into()), secret: secret.reveal().to_owned() })
         })
         .await
@@ -38,7 +38,7 @@ impl KeyService for Keys {
 
     async fn get_key(&self, request: tonic::Request<proto::GetKeyRequest>) -> Reply<proto::GetKeyResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let key = app.key(asked.key_id.parse()?).await?;
+            let key = app.keys().get(asked.key_id.parse()?).await?;
             Ok(proto::GetKeyResponse { key: Some(key.into()) })
         })
         .await
@@ -50,7 +50,7 @@ impl KeyService for Keys {
     ) -> Reply<proto::ListKeysResponse> {
         answer(&self.app, request, |app, asked| async move {
             let size = pages::size(asked.page_size, &app.limits)?;
-            let page = app.keys(pages::cursor::<KeyId>(&asked.page_token)?, size).await?;
+            let page = app.keys().list(pages::cursor::<KeyId>(&asked.page_token)?, size).await?;
             Ok(proto::ListKeysResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 keys: page.items.into_iter().map(Into::into).collect(),
@@ -64,7 +64,7 @@ impl KeyService for Keys {
         request: tonic::Request<proto::RevokeKeyRequest>,
     ) -> Reply<proto::RevokeKeyResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let key = app.revoke_key(asked.key_id.parse()?).await?;
+            let key = app.keys().revoke(asked.key_id.parse()?).await?;
             Ok(proto::RevokeKeyResponse { key: Some(key.into()) })
         })
         .await

@@ -26,7 +26,7 @@ impl ModelService for Models {
         request: tonic::Request<proto::GetModelRequest>,
     ) -> Reply<proto::GetModelResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let version = app.model(&camera_id(&asked.camera_id)?, asked.number).await?;
+            let version = app.models().get(&camera_id(&asked.camera_id)?, asked.number).await?;
             Ok(proto::GetModelResponse { model: Some(model(version)?) })
         })
         .await
@@ -39,7 +39,7 @@ impl ModelService for Models {
         answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
             let size = pages::size(asked.page_size, &app.limits)?;
-            let page = app.models(&camera, pages::cursor::<u32>(&asked.page_token)?, size).await?;
+            let page = app.models().list(&camera, pages::cursor::<u32>(&asked.page_token)?, size).await?;
             Ok(proto::ListModelsResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 models: page.items.into_iter().map(model).collect::<Result<_>>()?,
@@ -54,8 +54,8 @@ impl ModelService for Models {
     ) -> Reply<proto::ActivateModelResponse> {
         answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
-            app.activate_model(&camera, asked.number).await?;
-            let version = app.model(&camera, asked.number).await?;
+            app.models().activate(&camera, asked.number).await?;
+            let version = app.models().get(&camera, asked.number).await?;
             Ok(proto::ActivateModelResponse { model: Some(model(version)?) })
         })
         .await
@@ -67,8 +67,8 @@ impl ModelService for Models {
     ) -> Reply<proto::RollBackModelResponse> {
         answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
-            app.roll_back_model(&camera).await?;
-            let version = app.active_model(&camera).await?;
+            app.models().roll_back(&camera).await?;
+            let version = app.models().active(&camera).await?;
             Ok(proto::RollBackModelResponse { model: Some(model(version)?) })
         })
         .await
@@ -80,7 +80,7 @@ impl ModelService for Models {
     ) -> Reply<proto::DownloadModelResponse> {
         answer(&self.app, request, |app, asked| async move {
             let format = model_format(asked.format)?;
-            let file = app.download_model(&camera_id(&asked.camera_id)?, asked.number, format).await?;
+            let file = app.models().download(&camera_id(&asked.camera_id)?, asked.number, format).await?;
             Ok(match format {
                 ModelFormat::Safetensors => {
                     proto::DownloadModelResponse { safetensors: file, ..Default::default() }
@@ -100,7 +100,7 @@ impl ModelService for Models {
             if asked.safetensors.is_empty() {
                 return Err(Error::invalid("safetensors", "is required"));
             }
-            let version = app.import_model(&camera, &asked.safetensors).await?;
+            let version = app.models().import(&camera, &asked.safetensors).await?;
             Ok(proto::ImportModelResponse { model: Some(model(version)?) })
         })
         .await
@@ -111,7 +111,7 @@ impl ModelService for Models {
         request: tonic::Request<proto::DeleteModelRequest>,
     ) -> Reply<proto::DeleteModelResponse> {
         answer(&self.app, request, |app, asked| async move {
-            app.delete_model(&camera_id(&asked.camera_id)?, asked.number).await?;
+            app.models().delete(&camera_id(&asked.camera_id)?, asked.number).await?;
             Ok(proto::DeleteModelResponse {})
         })
         .await
@@ -122,7 +122,7 @@ impl ModelService for Models {
         request: tonic::Request<proto::EstimateGnssErrorRequest>,
     ) -> Reply<proto::EstimateGnssErrorResponse> {
         answer(&self.app, request, |app, asked| async move {
-            app.camera(&camera_id(&asked.camera_id)?).await?;
+            app.cameras().get(&camera_id(&asked.camera_id)?).await?;
             let rows = (1..).zip(asked.fixes).map(|(line, message)| match fix(message) {
                 Ok(fix) => Ok(Ok(TimedFix { time: None, fix })),
                 Err(error) => RowError::of(line, error).map(Err),

@@ -126,6 +126,8 @@ fn fix_format(format: i32) -> Result<FixFormat> {
         Ok(proto::FixFormat::Gpx) => Ok(FixFormat::Gpx),
         Ok(proto::FixFormat::Gpsd) => Ok(FixFormat::Gpsd),
         Ok(proto::FixFormat::Rtklib) => Ok(FixFormat::Rtklib),
+        Ok(proto::FixFormat::Fit) => Ok(FixFormat::Fit),
+        Ok(proto::FixFormat::GnssLogger) => Ok(FixFormat::GnssLogger),
         Err(_) => Err(unknown("fixes_format", format)),
     }
 }

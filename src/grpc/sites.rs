@@ -35,7 +35,7 @@ impl SiteService for Sites {
             let profile = new_site(SiteId::new(&asked.id)?, asked.profile.unwrap_or_default())
                 .and_then(NewSite::check)
                 .map_err(|error| error.under("profile"))?;
-            Ok(proto::CreateSiteResponse { site: Some(app.create_site(profile).await?.into()) })
+            Ok(proto::CreateSiteResponse { site: Some(app.sites().create(profile).await?.into()) })
         })
         .await
     }
@@ -45,7 +45,7 @@ impl SiteService for Sites {
         request: tonic::Request<proto::GetSiteRequest>,
     ) -> Reply<proto::GetSiteResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let site = app.site(&site_id(&asked.site_id)?).await?;
+            let site = app.sites().get(&site_id(&asked.site_id)?).await?;
             Ok(proto::GetSiteResponse { site: Some(site.into()) })
         })
         .await
@@ -58,7 +58,7 @@ impl SiteService for Sites {
         answer(&self.app, request, |app, asked| async move {
             let size = pages::size(asked.page_size, &app.limits)?;
             let after = pages::cursor::<SiteId>(&asked.page_token)?;
-            let page = app.sites(after.as_ref(), size).await?;
+            let page = app.sites().list(after.as_ref(), size).await?;
             Ok(proto::ListSitesResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 sites: page.items.into_iter().map(Into::into).collect(),
@@ -75,7 +75,7 @@ impl SiteService for Sites {
             let id = site_id(&asked.site_id)?;
             let expected = asked.expected_revision.map(|revision| Revision(revision).into());
             let change = site_change(&id, required(asked.profile, "profile")?, asked.update_mask)?;
-            let changed = app.change_site(&id, change, expected).await;
+            let changed = app.sites().change(&id, change, expected).await;
             let site = changed.map_err(|error| of_field(error, "profile"))?;
             Ok(proto::UpdateSiteResponse { site: Some(site.into()) })
         })
@@ -88,7 +88,9 @@ impl SiteService for Sites {
     ) -> Reply<proto::DeleteSiteResponse> {
         answer(&self.app, request, |app, asked| async move {
             let id = site_id(&asked.site_id)?;
-            app.delete_site(&id, asked.expected_revision.map(|revision| Revision(revision).into())).await?;
+            app.sites()
+                .delete(&id, asked.expected_revision.map(|revision| Revision(revision).into()))
+                .await?;
             Ok(proto::DeleteSiteResponse {})
         })
         .await
@@ -136,7 +138,7 @@ impl SiteService for Sites {
                 from: instant(asked.from, "from")?,
                 until: instant(asked.until, "until")?,
             };
-            let run = app.start_run(&site_id(&asked.site_id)?, options, idempotent).await?;
+            let run = app.training().start(&site_id(&asked.site_id)?, options, idempotent).await?;
             Ok(proto::StartSiteTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -147,7 +149,7 @@ impl SiteService for Sites {
         request: tonic::Request<proto::GetSiteTrainingRunRequest>,
     ) -> Reply<proto::GetSiteTrainingRunResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let run = app.run(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
+            let run = app.training().get(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::GetSiteTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -160,7 +162,7 @@ impl SiteService for Sites {
         answer(&self.app, request, |app, asked| async move {
             let site = site_id(&asked.site_id)?;
             let size = pages::size(asked.page_size, &app.limits)?;
-            let page = app.runs(&site, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
+            let page = app.training().list(&site, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
             Ok(proto::ListSiteTrainingRunsResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 runs: page.items.into_iter().map(Into::into).collect(),
@@ -174,7 +176,7 @@ impl SiteService for Sites {
         request: tonic::Request<proto::CancelSiteTrainingRunRequest>,
     ) -> Reply<proto::CancelSiteTrainingRunResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let run = app.cancel_run(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
+            let run = app.training().cancel(&site_id(&asked.site_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::CancelSiteTrainingRunResponse { run: Some(run.into()) })
         })
         .await

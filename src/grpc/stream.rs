@@ -51,7 +51,7 @@ struct StreamSession {
     outbox: Outbox,
 }
 
-/// Why no more items are read.
+/// Why reading of items ends.
 enum StopReason {
     /// The client has sent its last.
     HalfClosed,
@@ -351,7 +351,7 @@ impl From<&TrackPoint> for proto::TrackPoint {
             motion: Some(state.motion().into()),
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),
-            restarted: state.reinitialized,
+            restarted: state.restarted,
             sources_disagree: state.sources_disagree,
         }
     }
@@ -381,7 +381,7 @@ impl From<CameraMoved> for proto::CameraMoved {
     fn from(moved: CameraMoved) -> Self {
         Self {
             model_version: moved.model_version,
-            began_at: Some(timestamp(moved.began_at)),
+            onset_at: Some(timestamp(moved.onset_at)),
             raised_at: Some(timestamp(moved.raised_at)),
             shift_east_m: moved.shift_east_m,
             shift_north_m: moved.shift_north_m,

@@ -51,7 +51,7 @@ impl TrainingService for Training {
                 from: instant(asked.from, "from")?,
                 until: instant(asked.until, "until")?,
             };
-            let run = app.start_run(&camera_id(&asked.camera_id)?, options, idempotent).await?;
+            let run = app.training().start(&camera_id(&asked.camera_id)?, options, idempotent).await?;
             Ok(proto::StartTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -62,7 +62,7 @@ impl TrainingService for Training {
         request: tonic::Request<proto::GetTrainingRunRequest>,
     ) -> Reply<proto::GetTrainingRunResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let run = app.run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+            let run = app.training().get(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::GetTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -75,7 +75,7 @@ impl TrainingService for Training {
         answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
             let size = pages::size(asked.page_size, &app.limits)?;
-            let page = app.runs(&camera, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
+            let page = app.training().list(&camera, pages::cursor::<RunId>(&asked.page_token)?, size).await?;
             Ok(proto::ListTrainingRunsResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 runs: page.items.into_iter().map(Into::into).collect(),
@@ -89,7 +89,7 @@ impl TrainingService for Training {
         request: tonic::Request<proto::CancelTrainingRunRequest>,
     ) -> Reply<proto::CancelTrainingRunResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let run = app.cancel_run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+            let run = app.training().cancel(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::CancelTrainingRunResponse { run: Some(run.into()) })
         })
         .await
@@ -100,7 +100,7 @@ impl TrainingService for Training {
         request: tonic::Request<proto::DeleteTrainingRunRequest>,
     ) -> Reply<proto::DeleteTrainingRunResponse> {
         answer(&self.app, request, |app, asked| async move {
-            app.delete_run(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+            app.training().delete(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::DeleteTrainingRunResponse {})
         })
         .await
@@ -117,7 +117,7 @@ impl TrainingService for Training {
         answer(&self.app, request, |app, asked| async move {
             let lease = app.quotas.event_streams.try_acquire(client, 1)?;
             let (camera, run) = (camera_id(&asked.camera_id)?, run_id(&asked.run_id)?);
-            let runs = app.watch_run(&camera, run).await?;
+            let runs = app.training().watch(&camera, run).await?;
             Ok(changes(runs, lease, self.shutdown.clone(), id))
         })
         .await
@@ -128,7 +128,7 @@ impl TrainingService for Training {
         request: tonic::Request<proto::GetTrainingLogRequest>,
     ) -> Reply<proto::GetTrainingLogResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let log = app.run_log(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+            let log = app.training().log(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
             let line = |(time, text)| proto::TrainingLogLine { time: Some(timestamp(time)), text };
             Ok(proto::GetTrainingLogResponse { lines: log.into_iter().map(line).collect() })
         })
@@ -140,7 +140,7 @@ impl TrainingService for Training {
         request: tonic::Request<proto::GetTrainingCurveRequest>,
     ) -> Reply<proto::GetTrainingCurveResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let epochs = app.run_epochs(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
+            let epochs = app.training().epochs(&camera_id(&asked.camera_id)?, run_id(&asked.run_id)?).await?;
             Ok(proto::GetTrainingCurveResponse { epochs: epochs.into_iter().map(Into::into).collect() })
         })
         .await

@@ -140,7 +140,7 @@ mod tests {
             for item in out {
                 times[item as usize] += 1;
                 newest = newest.max(item);
-                // Lost items count too, so an item is at most `max_delay` behind the newest one.
+                // Lost items count too, so an item arrives at most `max_delay` items after a newer one.
                 prop_assert!(newest - item <= max_delay, "{item} after {newest}");
             }
             prop_assert!(times.iter().all(|times| *times <= 2));

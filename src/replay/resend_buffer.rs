@@ -247,7 +247,7 @@ mod tests {
         assert!(buffer.mark_sent(now), "it was sent before");
         assert!(!buffer.answer(2, now).expect("awaited").is_first);
         assert!(buffer.acknowledge(4));
-        assert!(buffer.is_empty(), "4 was acknowledged and is awaited no more");
+        assert!(buffer.is_empty(), "4 was acknowledged and is no longer awaited");
         assert_eq!((buffer.assigned(), buffer.unanswered()), (4, 1));
     }
 

@@ -1,5 +1,5 @@
 //! Connections: accepted up to a limit, each with a deadline for everything that a client may leave
-//! half done, and closed when it is of no more use.
+//! half done, and closed when it is no longer needed.
 //!
 //! `axum::serve` sets no deadlines: a half-sent header would stay open without end.
 
@@ -36,7 +36,7 @@ const SMALLEST_BUFFER: u32 = 8 << 10;
 const PING_TIME: Duration = Duration::from_secs(10);
 /// Bytes of one HTTP/2 stream that wait for a client who does not read.
 const SEND_BUFFER: usize = 128 << 10;
-/// How often a connection is looked at, to close it in time if it is of no more use.
+/// How often a connection is looked at, to close it in time if it is no longer needed.
 const LOOKS_PER_IDLE_TIME: u32 = 8;
 /// Time for the last bytes of a connection that is dropped by the shutdown.
 const LAST_BYTES_TIME: Duration = Duration::from_millis(500);
@@ -251,7 +251,7 @@ fn is_of_this_machine(stream: &TcpStream, peer: &Peer) -> bool {
     peer.address.is_loopback() || stream.local_addr().is_ok_and(is_own)
 }
 
-/// Decides when a connection is of no more use.
+/// Decides when a connection is no longer needed.
 struct Closing {
     idle_time: Duration,
     bytes_per_s: u64,

@@ -226,7 +226,7 @@ impl Record {
         self.lock().stop();
     }
 
-    /// The whole body from its start, unless more was read than is recorded. The reader here gets no more of it.
+    /// The whole body from its start, unless more was read than is recorded. The reader here gets nothing further of it.
     fn replay(&self) -> Option<Replay> {
         let mut recorded = self.lock();
         let read = recorded.read.take()?;

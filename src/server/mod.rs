@@ -256,7 +256,7 @@ async fn prepare_access(app: &App, config: &Config) -> anyhow::Result<()> {
         let secret = KeySecret::parse(secret.reveal()).context(
             "the setting admin_key, or the file admin_key_file, must be a key of `sightfix keys generate`",
         )?;
-        app.ensure_admin_key(&secret).await?;
+        app.keys().ensure_admin(&secret).await?;
     }
     let is_loopback = config.listen.ip().is_loopback();
     if !app.access.is_open() {

@@ -362,13 +362,18 @@ impl RequestPipeline {
         let address = ClientId::from(context.address());
         let is_stranger = matches!(error.kind(), ErrorKind::Unauthenticated | ErrorKind::PermissionDenied);
         let is_in_debt = is_stranger && bodies.wait(address, now()).is_some();
-        // HTTP/2 ends the stream alone, and one that waits for `100 Continue` sends no more.
-        let is_read = request.version() < Version::HTTP_2 && !request.headers().contains_key(EXPECT);
+        // HTTP/2 ends the request's stream without its body.
+        let is_read = request.version() < Version::HTTP_2 && !awaits_continue(&request);
         let bytes = self.discards.read((is_read && !is_in_debt).then(|| request.into_body())).await;
         if is_stranger {
             bodies.charge(address, bytes, now());
         }
     }
+}
+
+/// True if the client waits for `100 Continue`: it does not send the body of a refused request.
+fn awaits_continue<B>(request: &Request<B>) -> bool {
+    request.headers().contains_key(EXPECT)
 }
 
 /// Grants the request memory, its body a least rate, and a place among the requests at work once the body has come.
@@ -384,8 +389,8 @@ async fn admit<S: Next<Exchange<Body>, Error>>(
         return Err(error);
     }
     let is_encoded = request.headers().contains_key(CONTENT_ENCODING);
-    // HTTP/2 ends the stream alone, and one that waits for `100 Continue` sends no more.
-    let is_discarded = !context.is_grpc() && !request.headers().contains_key(EXPECT);
+    // gRPC ends the request's stream without its body.
+    let is_discarded = !context.is_grpc() && !awaits_continue(&request);
     let limits = &pipeline.app.limits;
     // A live stream may be silent for longer, and looks after that itself.
     let pace = (context.class() != RequestClass::LiveStream)

@@ -131,6 +131,10 @@ impl Job for EvaluationJob {
         finish(app, claim, end).await
     }
 
+    async fn requeue(app: &App, claim: &Claim<Self>) -> Result<Option<JobState>> {
+        finish(app, claim, JobEnd::Requeue).await
+    }
+
     async fn fail(app: &App, claim: &Claim<Self>, outcome: String) -> Result<Option<JobState>> {
         finish(app, claim, JobEnd::Failed { outcome }).await
     }

@@ -102,6 +102,8 @@ trait Job: Send + Sync + Sized + 'static {
         ended: Ended<Self>,
         lease: Duration,
     ) -> impl Future<Output = Result<Option<JobState>>> + Send;
+    /// Returns the job to the queue, for the server shuts down: no attempt is counted. `None` if the lease was lost.
+    fn requeue(app: &App, claim: &Claim<Self>) -> impl Future<Output = Result<Option<JobState>>> + Send;
     /// Finishes the job with an error; `None` if the lease was lost.
     fn fail(
         app: &App,
@@ -125,6 +127,7 @@ async fn work<J: Job>(app: App, settings: Workers, shutdown: Shutdown) {
     let lease = Duration::from_secs(settings.lease_s.into());
     loop {
         let slot = tokio::select! {
+            biased;
             () = shutdown.draining() => return,
             slot = slots.clone().acquire_owned() => slot.expect("the semaphore is never closed"),
         };
@@ -196,7 +199,12 @@ async fn run_attempt<J: Job>(
         let outcome = format!("given up: {MAX_ATTEMPTS} workers claimed it and none finished it");
         return J::fail(app, claim, outcome).await;
     }
-    let mut thread = JobThread::spawn(J::NAME, J::prepare(app, claim).await?).map_err(Error::fault)?;
+    let prepared = tokio::select! {
+        biased;
+        () = shutdown.draining() => return J::requeue(app, claim).await,
+        prepared = J::prepare(app, claim) => prepared?,
+    };
+    let mut thread = JobThread::spawn(J::NAME, prepared).map_err(Error::fault)?;
     if claim.cancel_requested {
         thread.cancel();
     }
@@ -211,6 +219,8 @@ async fn run_attempt<J: Job>(
                 shutting_down = true;
                 thread.cancel();
             }
+            // Its next step may be far away. The process ends without its thread.
+            () = shutdown.forced() => return J::requeue(app, claim).await,
         }
         match J::record(app, claim, thread.take_progress(), lease).await {
             Ok(Heartbeat::Continue) => renewed = Instant::now(),
@@ -257,4 +267,40 @@ async fn load_samples(app: &App, camera: &CameraId, filter: &SampleFilter, most:
 /// Stored boxes without a fix for a fit, thinned to the limit.
 async fn load_unpaired(app: &App, camera: &CameraId, filter: &SampleFilter) -> Result<Vec<Detection>> {
     app.store.thinned_detections(camera, filter, app.limits.boxes_without_fix_per_run).await
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+
+    use super::*;
+    use crate::clock::{Clock, Randomness};
+    use crate::config::Limits;
+    use crate::domain::{NewCamera, Recipe, RunId, TrainingOptions};
+    use crate::store::Store;
+
+    #[tokio::test]
+    async fn a_run_that_is_claimed_while_the_server_shuts_down_returns_to_the_queue() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let store = Store::open(folder.path()).await.expect("a new store");
+        let id = CameraId::new("yard").expect("a slug");
+        store.insert_camera(&NewCamera::named(id.clone()), Timestamp::UNIX_EPOCH).await.expect("new");
+        let (clock, randomness) = (Clock::system(), Randomness::system());
+        let metrics = Metrics::new();
+        let app =
+            App::new(store, clock, randomness, Limits::default(), metrics).await.expect("an application");
+        let options =
+            TrainingOptions { recipe: Recipe::Auto, seed: 1, epochs: None, from: None, until: None };
+        let queued = RunId(app.randomness.uuid_v7(app.clock.now()));
+        app.store.insert_run(queued, &id, &options, 1, None, app.clock.now()).await.expect("queued");
+        let lease = Duration::from_secs(30);
+        let claim = TrainingRun::<CameraId>::claim(&app, lease).await.expect("claimed").expect("the run");
+        assert_eq!(claim.job.attempt, 1);
+        let shutdown = Shutdown::new();
+        shutdown.drain();
+        // A run that begins fails: the camera has no samples.
+        run_to_end(&app, claim, lease, &shutdown).await;
+        let run = app.training().get(&id, queued).await.expect("known");
+        assert_eq!((run.state, run.attempt), (JobState::Queued, 0));
+    }
 }

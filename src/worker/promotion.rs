@@ -233,9 +233,9 @@ async fn measure(
     if new.held_out.is_empty() {
         return Ok(Finding::Incomparable(number, "the new one has no held-out errors to compare"));
     }
-    let moved_at = app.store.camera_move(id, number).await?.map(|moved| moved.began_at);
+    let onset_at = app.store.camera_move(id, number).await?.map(|moved| moved.onset_at);
     let counts =
-        |time: Timestamp| new.range.contains(time) && moved_at.is_none_or(|moved_at| time >= moved_at);
+        |time: Timestamp| new.range.contains(time) && onset_at.is_none_or(|onset_at| time >= onset_at);
     let stored = app.store.held_out_errors(id, number).await?;
     if stored.is_empty() {
         let recorded = app.store.model(id, number).await?.metadata;

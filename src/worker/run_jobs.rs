@@ -73,7 +73,7 @@ impl<S: Trained> Job for TrainingRun<S> {
     }
 
     fn queue(app: &App) -> &JobQueue {
-        S::queue(app)
+        S::queue(&app.training_queues)
     }
 
     fn metrics(metrics: &Metrics) -> &JobMetrics {
@@ -109,9 +109,7 @@ impl<S: Trained> Job for TrainingRun<S> {
         }
         match output {
             Ok(fitted) => S::succeed(app, claim, fitted).await,
-            Err(FitError::Cancelled) if shutting_down => {
-                finish(app, claim, "returned to the queue: the server shuts down", JobEnd::Requeue).await
-            }
+            Err(FitError::Cancelled) if shutting_down => Self::requeue(app, claim).await,
             Err(FitError::Cancelled) => finish(app, claim, "cancelled", JobEnd::Cancelled).await,
             Err(FitError::Unusable(error)) => {
                 let outcome = error.to_string();
@@ -119,6 +117,10 @@ impl<S: Trained> Job for TrainingRun<S> {
             }
             Err(FitError::Fault(error)) => Err(Error::fault(error)),
         }
+    }
+
+    async fn requeue(app: &App, claim: &Claim<Self>) -> Result<Option<JobState>> {
+        finish(app, claim, "returned to the queue: the server shuts down", JobEnd::Requeue).await
     }
 
     async fn fail(app: &App, claim: &Claim<Self>, outcome: String) -> Result<Option<JobState>> {

@@ -35,7 +35,7 @@ impl Trained for SiteId {
     async fn prepare(app: &App, claim: &Claim<TrainingRun<Self>>) -> Result<Work<TrainingRun<Self>>> {
         let TrainingRun { id, subject: site, options, .. } = &claim.job;
         let filter = SampleFilter::within(TimeRange::new(options.from, options.until)?);
-        let cameras = app.cameras_to_train(site).await?;
+        let cameras = app.training().cameras_of(site).await?;
         let most = app.limits.samples_per_site_run / cameras.len() as u32;
         let mut loaded = Vec::with_capacity(cameras.len());
         for camera in cameras {

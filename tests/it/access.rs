@@ -669,7 +669,7 @@ async fn a_key_works_again_when_a_wrong_clock_is_set_back() {
     let expires_at = app.clock.now() + jiff::SignedDuration::from_hours(1);
     let scope = Scope::new(Role::Viewer, Vec::new()).expect("a scope");
     let key = NewKey::new("report", scope, Some(expires_at), app.clock.now()).expect("a key");
-    let (_, secret) = app.create_key(&key).await.expect("stored");
+    let (_, secret) = app.keys().create(&key).await.expect("stored");
     let running = tokio::spawn(server.run());
     let client: HttpClient<_, Full<Bytes>> = HttpClient::builder(TokioExecutor::new()).build_http();
     let status = async || {

@@ -1,7 +1,10 @@
 //! The operator's console and what the interface answers for it.
 
+use std::collections::BTreeSet;
+
 use hyper::body::Bytes;
 use serde_json::{Value, json};
+use sightfix::domain::Recipe;
 
 use crate::harness::{TestServer, data_folder, sightfix, simulated_csv};
 
@@ -13,6 +16,14 @@ async fn asset(server: &TestServer, path: &str, headers: &[(&str, &str)]) -> cra
 fn assets_of(page: &str) -> Vec<String> {
     let paths = page.split('"').filter(|part| part.starts_with("/assets/"));
     paths.map(ToOwned::to_owned).collect()
+}
+
+#[test]
+fn the_console_describes_each_recipe() {
+    let texts = include_str!("../../console/src/lib/texts.ts");
+    let keys = texts.lines().filter_map(|line| line.trim_start().strip_prefix("'recipe."));
+    let described: BTreeSet<&str> = keys.filter_map(|rest| rest.split('\'').next()).collect();
+    assert_eq!(described, Recipe::ALL.iter().map(|recipe| recipe.as_str()).collect());
 }
 
 #[tokio::test]

@@ -67,7 +67,7 @@ async fn imports_in_two_parts_wait_for_a_place() {
     let (address, app, shutdown) =
         (server.address().expect("an address"), server.app().clone(), server.shutdown());
     let camera = sightfix::domain::CameraId::new("c").expect("a slug");
-    app.create_camera(sightfix::domain::NewCamera::named(camera)).await.expect("a new camera");
+    app.cameras().create(sightfix::domain::NewCamera::named(camera)).await.expect("a new camera");
     let serving = tokio::spawn(server.run());
     let request = two_parts(
         "",

@@ -321,7 +321,7 @@ async fn a_wall_clock_that_jumps_back_keeps_no_target_out() {
     let server = Server::bind(config, clock, Randomness::seeded(1)).await.expect("a free port");
     let app = server.app();
     let id = CameraId::new("yard").expect("a slug");
-    app.create_camera(NewCamera::named(id.clone())).await.expect("a new camera");
+    app.cameras().create(NewCamera::named(id.clone())).await.expect("a new camera");
     let (camera, lease) = app.own_camera(&id).await.expect("known");
     let follow = |name: &str| {
         let time = Timestamp::from_second(wall_s.load(Ordering::SeqCst)).expect("in range");

@@ -72,7 +72,7 @@ impl Recording {
         self.samples.iter().map(|row| (row.time + late, row.numbers[4], row.numbers[5])).collect()
     }
 
-    fn write(&self, name: &str, text: &str) -> PathBuf {
+    fn write(&self, name: &str, text: impl AsRef<[u8]>) -> PathBuf {
         let path = self.folder.path().join(name);
         std::fs::write(&path, text).expect("written");
         path
@@ -196,22 +196,61 @@ fn gpsd(fixes: &[(jiff::Timestamp, f64, f64)]) -> String {
     log
 }
 
+/// An activity with one definition and a record per fix.
+fn fit(fixes: &[(jiff::Timestamp, f64, f64)]) -> Vec<u8> {
+    let mut messages = vec![0x40, 0, 0, 20, 0, 3, 253, 4, 0x86, 0, 4, 0x85, 1, 4, 0x85];
+    for (time, longitude, latitude) in fixes {
+        let second = u32::try_from(time.as_second() - 631_065_600).expect("after 1989");
+        let semicircles =
+            [latitude, longitude].map(|degrees| (degrees / 180.0 * 2_147_483_648.0).round() as i32);
+        messages.push(0);
+        messages.extend(
+            second.to_le_bytes().into_iter().chain(semicircles.into_iter().flat_map(i32::to_le_bytes)),
+        );
+    }
+    let mut file = vec![12, 0x10, 0, 0];
+    file.extend(
+        u32::try_from(messages.len()).expect("short").to_le_bytes().iter().chain(b".FIT").chain(&messages),
+    );
+    let checksum = file.iter().fold(0_u16, |sum, byte| {
+        (0..8).fold(sum ^ u16::from(*byte), |sum, _| if sum & 1 == 1 { sum >> 1 ^ 0xA001 } else { sum >> 1 })
+    });
+    file.extend(checksum.to_le_bytes());
+    file
+}
+
+fn gnss_logger(fixes: &[(jiff::Timestamp, f64, f64)]) -> String {
+    let mut log =
+        "# Header Description:\n# Fix,Provider,LatitudeDegrees,LongitudeDegrees,AltitudeMeters,SpeedMps,\
+        AccuracyMeters,BearingDegrees,UnixTimeMillis\n"
+            .to_owned();
+    for (time, longitude, latitude) in fixes {
+        let millisecond = time.as_millisecond();
+        writeln!(log, "Fix,GPS,{latitude},{longitude},500.0,1.1,3.8,20.0,{millisecond}").expect("memory");
+        writeln!(log, "Fix,NLP,{latitude},{longitude},,,400.0,,{millisecond}").expect("memory");
+    }
+    log
+}
+
 #[test]
 fn every_format_of_fixes_gives_the_same_samples() {
     let recording = Recording::simulated("1", "400");
     let fixes = recording.anonymous_fixes(0.0);
     for (name, text, flags) in [
-        ("fixes.nmea", nmea(&fixes), &[][..]),
-        ("fixes.gpx", gpx(&fixes), &[]),
-        ("fixes.json", gpsd(&fixes), &[]),
-        ("fixes.dat", gpsd(&fixes), &["--fixes-format", "gpsd"]),
+        ("fixes.nmea", nmea(&fixes).into_bytes(), &[][..]),
+        ("fixes.gpx", gpx(&fixes).into_bytes(), &[]),
+        ("fixes.json", gpsd(&fixes).into_bytes(), &[]),
+        ("fixes.dat", gpsd(&fixes).into_bytes(), &["--fixes-format", "gpsd"]),
+        ("fixes.fit", fit(&fixes), &[]),
+        ("gnss_log.txt", gnss_logger(&fixes).into_bytes(), &[]),
     ] {
         let (printed, found) = recording.pair(&recording.write(name, &text), flags);
         assert_eq!(found.len(), recording.samples.len(), "{name}: {printed}");
         for (found, expected) in found.iter().zip(&recording.samples) {
             assert_eq!((found.time, &found.target_id), (expected.time, &expected.target_id), "{name}");
             for (one, other) in found.numbers.iter().zip(expected.numbers) {
-                assert!((one - other).abs() < 2e-8, "{name}: {found:?} is not {expected:?}");
+                // Half of the unit of FIT is 4.2e-8 degrees.
+                assert!((one - other).abs() < 5e-8, "{name}: {found:?} is not {expected:?}");
             }
         }
     }

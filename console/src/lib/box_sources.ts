@@ -18,6 +18,8 @@ export interface BoxSource {
 }
 
 const MQTT = 'mqtt://broker:1883';
+/** A camera's stream; the other is that of an Axis camera. */
+const RTSP = ['rtsp://camera:554/', 'rtsp://camera/axis-media/media.amp?camera=1&audio=0&video=0&analytics=polygon'];
 
 /** AXIS scene metadata. */
 const AXIS: JsonMapping = {
@@ -31,7 +33,7 @@ const AXIS: JsonMapping = {
 
 export const BOX_SOURCES: BoxSource[] = [
   { key: 'frigate', text: 'boxes.frigate', help: 'boxes.frigate.help', addresses: [MQTT], format: 'frigate', topics: 'frigate/events' },
-  { key: 'onvif', text: 'boxes.onvif', help: 'boxes.onvif.help', addresses: [MQTT, 'push:'], format: 'onvif', needsSize: true },
+  { key: 'onvif', text: 'boxes.onvif', help: 'boxes.onvif.help', addresses: [...RTSP, MQTT, 'push:'], format: 'onvif', needsSize: true },
   { key: 'axis', text: 'boxes.axis', help: 'boxes.axis.help', addresses: [MQTT, 'push:'], format: 'json', mapping: AXIS, needsSize: true },
   { key: 'deepstream', text: 'boxes.deepstream', help: 'boxes.deepstream.help', addresses: [MQTT, 'kafka://broker:9092'], format: 'deepstream' },
   { key: 'json', text: 'boxes.json', help: 'boxes.json.help', addresses: [MQTT, 'kafka://broker:9092', 'push:'], format: 'json' },
@@ -52,24 +54,26 @@ export function emptyForm(source: BoxSource): BoxSourceForm {
   return { address: source.addresses[0] ?? '', topics: source.topics ?? '', senderName: '', username: '', password: '' };
 }
 
-/** Whether an address has topics, and users. */
-export const isBroker = (address: string): boolean => /^(mqtts?|kafkas?):/.test(address);
+/** Whether an address has topics. */
+export const hasTopics = (address: string): boolean => /^(mqtts?|kafkas?):/.test(address);
+/** Whether an address may ask for a user. */
+export const hasUsers = (address: string): boolean => hasTopics(address) || /^rtsps?:/.test(address);
 
 /** The request for the connection that brings a camera's boxes. */
 export function connectionOf(source: BoxSource, form: BoxSourceForm, camera: { id: string; name: string }, mapping?: JsonMapping): object {
-  const broker = isBroker(form.address);
+  const users = hasUsers(form.address);
   return {
     id: slugOf(`${source.key} ${camera.id}`),
     display_name: camera.name,
     source: {
       address: form.address.trim(),
       format: source.format,
-      ...(broker ? { topics: form.topics.split(/[\s,]+/).filter(Boolean) } : {}),
-      ...(broker && form.username.trim() ? { username: form.username.trim() } : {}),
+      ...(hasTopics(form.address) ? { topics: form.topics.split(/[\s,]+/).filter(Boolean) } : {}),
+      ...(users && form.username.trim() ? { username: form.username.trim() } : {}),
       ...(mapping ? { mapping } : {}),
       cameras: { [form.senderName.trim() || '*']: { camera_id: camera.id } },
       store_samples: true,
     },
-    secrets: broker && form.password ? { password: form.password } : {},
+    secrets: users && form.password ? { password: form.password } : {},
   };
 }

@@ -25,7 +25,7 @@ const sink = (key: string, text: TextKey, format: string, addresses: string[], f
 export const KINDS: Kind[] = [
   detector('frigate', 'connections.kind.frigate', [MQTT, 'push:']),
   detector('deepstream', 'connections.kind.deepstream', [MQTT, KAFKA, 'push:']),
-  detector('onvif', 'connections.kind.onvif', ['push:', MQTT]),
+  detector('onvif', 'connections.kind.onvif', ['rtsp://camera:554/', 'push:', MQTT]),
   receiver('nmea', 'connections.kind.nmea', ['tcp://receiver:4001', 'udp://0.0.0.0:10110', 'tcp-listen://0.0.0.0:10110', 'serial:///dev/ttyUSB0?baud=4800', MQTT], ['receiver_id']),
   receiver('gpsd', 'connections.kind.gpsd', ['gpsd://localhost:2947']),
   receiver('traccar', 'connections.kind.traccar', ['push:']),
@@ -41,13 +41,15 @@ export const KINDS: Kind[] = [
 
 const schemeOf = (address: string): string => address.split(':')[0]!;
 /** The name of a user, its password and an authority belong to addresses that have a peer to sign in at. */
-const isEncrypted = (address: string): boolean => /^(mqtts|kafkas|tls|https)$/.test(schemeOf(address));
+const isEncrypted = (address: string): boolean => /^(mqtts|kafkas|rtsps|tls|https)$/.test(schemeOf(address));
+const isBroker = (address: string): boolean => /^(mqtts?|kafkas?|nats)$/.test(schemeOf(address));
+const hasUsers = (address: string): boolean => isBroker(address) || /^rtsps?$/.test(schemeOf(address));
 
 /** Fields of a kind that an address leaves open. */
 export function fieldsOf(kind: Kind, address: string): Field[] {
-  const isBroker = /^(mqtts?|kafkas?|nats)$/.test(schemeOf(address));
   return kind.fields.filter((field) => {
-    if (field === 'topics' || field === 'topic' || field === 'username') return isBroker;
+    if (field === 'topics' || field === 'topic') return isBroker(address);
+    if (field === 'username') return hasUsers(address);
     return field === 'ca_certificate' ? isEncrypted(address) : true;
   });
 }
@@ -56,7 +58,7 @@ export function fieldsOf(kind: Kind, address: string): Field[] {
 export function secretsOf(kind: Kind, address: string): Secret[] {
   const scheme = schemeOf(address);
   return [
-    ...(/^(mqtts?|kafkas?|nats)$/.test(scheme) ? (['password'] as const) : []),
+    ...(hasUsers(address) ? (['password'] as const) : []),
     ...(kind.direction === 'sink' && /^https?$/.test(scheme) ? (['signing_key', 'authorization'] as const) : []),
     ...(isEncrypted(address) ? (['client_certificate', 'client_key'] as const) : []),
   ];

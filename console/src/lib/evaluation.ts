@@ -1,7 +1,8 @@
 // Curves and extents of an evaluation's positions.
 import type { Palette } from './draw';
 import { toPlane, type EastNorth } from './geo';
-import type { EvaluatedPosition, Evaluation, Position, Recipe } from './types';
+import type { Recipe } from './recipes';
+import type { EvaluatedPosition, Evaluation, Position } from './types';
 
 /** What a recipe is compared with: the receiver, a filter, and a plain homography. */
 export function comparedMethods(recipe: Recipe): string[] {

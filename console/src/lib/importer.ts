@@ -11,7 +11,7 @@ const NEWLINE = 10;
 
 export interface SourceFile {
   file: File;
-  /** Its first rows. Missing for NMEA and GPX, which the server reads itself. */
+  /** Its first rows. Missing for files of receivers, which the server reads itself. */
   table?: Table;
   mapping: Mapping;
 }

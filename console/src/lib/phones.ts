@@ -51,9 +51,8 @@ export const phoneConnectionId = (camera: string): string => slugOf(`phones ${ca
 export async function ensurePhoneConnection(camera: string): Promise<string> {
   const id = phoneConnectionId(camera);
   const known = await getAll<Connection>('/v1/connections', 1000);
-  // Messages that name no receiver are of the one that the key is named after. Storing samples would let each answer wait
-  // seconds for its box, and applications send one position after the other.
-  const source = { address: 'push:', format: 'phone', camera_ids: [camera], receiver_from: 'sender' };
+  // Messages that name no receiver are of the one that the key is named after.
+  const source = { address: 'push:', format: 'phone', camera_ids: [camera], receiver_from: 'sender', store_samples: true };
   if (!known.some((it) => it.id === id)) await post('/v1/connections', { id, display_name: `${t('connections.kind.phone')}: ${camera}`, source });
   return `${location.origin}/v1/connections/${id}/messages`;
 }

@@ -1,4 +1,5 @@
 // The shapes of the REST interface that the console reads (docs/openapi.json).
+import type { Recipe } from './recipes';
 
 export interface Position {
   longitude_deg: number;
@@ -17,7 +18,6 @@ export interface ImageSize {
   width_px: number;
   height_px: number;
 }
-export type Recipe = 'auto' | 'gaussian_process' | 'projective' | 'hybrid' | 'paper';
 export type JobState = 'queued' | 'running' | 'cancelling' | 'succeeded' | 'failed' | 'cancelled';
 
 /** Whether a job has not ended. */
@@ -34,7 +34,7 @@ export interface Receiver {
 }
 export interface CameraMoved {
   model_version: number;
-  began_at: string;
+  onset_at: string;
   raised_at: string;
   shift_east_m: number;
   shift_north_m: number;
@@ -137,24 +137,27 @@ export interface RunProgress {
   error_scale: number | null;
   remaining_s?: number | null;
 }
-export interface TrainingRun {
+/** What training runs of cameras and of sites have in common. */
+interface Run {
   id: string;
-  camera_id: string;
-  recipe: Recipe;
   seed: number;
-  epochs?: number;
   from?: string;
   until?: string;
   state: JobState;
   progress: RunProgress;
-  attempt: number;
-  model_version?: number;
   outcome?: string;
-  /** Of models that came with a report. */
-  report?: { advice: string[] };
   created_at: string;
   started_at?: string;
   ended_at?: string;
+}
+export interface TrainingRun extends Run {
+  camera_id: string;
+  recipe: Recipe;
+  epochs?: number;
+  attempt: number;
+  model_version?: number;
+  /** Of models that came with a report. */
+  report?: { advice: string[] };
 }
 /** How long a run that has ended took, s. */
 export function ranFor({ started_at, ended_at }: { started_at?: string; ended_at?: string }): number | undefined {
@@ -169,14 +172,8 @@ export interface SiteCameraFinding {
   coverage95_of_fixes: number;
   comparison: string;
 }
-export interface SiteTrainingRun {
-  id: string;
+export interface SiteTrainingRun extends Run {
   site_id: string;
-  seed: number;
-  from?: string;
-  until?: string;
-  state: JobState;
-  progress: RunProgress;
   report?: {
     is_activated: boolean;
     receivers: number;
@@ -185,10 +182,6 @@ export interface SiteTrainingRun {
     disagreement_apart_m?: number;
     cameras: SiteCameraFinding[];
   };
-  outcome?: string;
-  created_at: string;
-  started_at?: string;
-  ended_at?: string;
 }
 export interface EpochReport {
   epoch: number;

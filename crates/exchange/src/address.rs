@@ -18,6 +18,8 @@ pub enum Scheme {
     TcpListen,
     Udp,
     Gpsd,
+    Rtsp,
+    Rtsps,
     Push,
     Http,
     Https,
@@ -40,6 +42,8 @@ impl Scheme {
         Self::Udp,
         Self::Serial,
         Self::Gpsd,
+        Self::Rtsp,
+        Self::Rtsps,
         Self::Push,
     ];
     pub(super) const SINKS: &[Self] = &[
@@ -69,6 +73,8 @@ impl Scheme {
             Self::TcpListen => "tcp-listen",
             Self::Udp => "udp",
             Self::Gpsd => "gpsd",
+            Self::Rtsp => "rtsp",
+            Self::Rtsps => "rtsps",
             Self::Push => "push",
             Self::Http => "http",
             Self::Https => "https",
@@ -85,6 +91,8 @@ impl Scheme {
             Self::Mqtt => Some(1883),
             Self::Mqtts => Some(8883),
             Self::Gpsd => Some(2947),
+            Self::Rtsp => Some(554),
+            Self::Rtsps => Some(322),
             Self::Http => Some(80),
             Self::Https => Some(443),
             Self::Nats => Some(4222),
@@ -106,6 +114,16 @@ impl Scheme {
         matches!(self, Self::Mqtt | Self::Mqtts)
     }
 
+    /// True if it is RTSP, plain or encrypted.
+    pub(super) const fn is_rtsp(self) -> bool {
+        matches!(self, Self::Rtsp | Self::Rtsps)
+    }
+
+    /// True if an address of this kind goes on after the port.
+    const fn has_path(self) -> bool {
+        self.is_rtsp() || matches!(self, Self::Http | Self::Https)
+    }
+
     /// True if it is Kafka, plain or encrypted.
     pub(super) const fn is_kafka(self) -> bool {
         matches!(self, Self::Kafka | Self::Kafkas)
@@ -123,7 +141,7 @@ pub struct Address {
     pub port: u16,
     /// Further machines of a cluster of Kafka, each with its port.
     pub others: Vec<(String, u16)>,
-    /// Path and query, from `/` on, of a webhook or a serial device.
+    /// Path and query, from `/` on, of a webhook, an RTSP stream or a serial device.
     pub path: String,
 }
 
@@ -171,8 +189,7 @@ impl Address {
         if authority.contains('@') {
             return Err(invalid("must not contain a user; give username and the secret password".to_owned()));
         }
-        let has_path = matches!(scheme, Scheme::Http | Scheme::Https);
-        if !has_path && !matches!(path, "" | "/") {
+        if !scheme.has_path() && !matches!(path, "" | "/") {
             return Err(invalid("must end after the port".to_owned()));
         }
         if path.contains(|it: char| it.is_whitespace() || !it.is_ascii()) {

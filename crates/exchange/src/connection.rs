@@ -135,7 +135,8 @@ pub struct SourceSettings {
     /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]`, `kafka://HOST[:9092]` and `kafkas://HOST[:9093]` subscribe, Kafka to a
     /// cluster of several hosts with commas between them; `tcp://`,
     /// `tls://` and `gpsd://HOST[:2947]` connect and read lines; `serial:///dev/DEVICE?baud=4800` reads lines of a serial
-    /// device of the server's machine; `udp://ADDRESS:PORT` and `tcp-listen://ADDRESS:PORT` take what is sent there; `push:` takes
+    /// device of the server's machine; `rtsp://HOST[:554]/PATH` and `rtsps://HOST[:322]/PATH` read the ONVIF metadata of a
+    /// camera's stream; `udp://ADDRESS:PORT` and `tcp-listen://ADDRESS:PORT` take what is sent there; `push:` takes
     /// `POST /v1/connections/{connection}/messages`.
     #[schema(max_length = 512, example = "mqtt://broker.example.org:1883")]
     pub address: String,
@@ -183,7 +184,8 @@ pub struct SourceSettings {
     /// numbers of a tracker, and boxes are matched with receivers by their positions.
     #[serde(default)]
     pub ids_name_targets: bool,
-    /// True if boxes and fixes are paired and stored as samples. Messages are acknowledged when that is done.
+    /// True if boxes and fixes are paired and stored as samples. Messages are acknowledged when that is done, but those
+    /// that phones push (`push:` with the format `phone`) when they were taken.
     #[serde(default)]
     pub store_samples: bool,
 }
@@ -430,6 +432,9 @@ impl SourceSettings {
         if address.scheme == Scheme::Gpsd && self.format != MessageFormat::Gpsd {
             return Err(Error::invalid("format", "must be gpsd for an address of gpsd:"));
         }
+        if address.scheme.is_rtsp() && self.format != MessageFormat::Onvif {
+            return Err(Error::invalid("format", "must be onvif for an address of rtsp: or rtsps:"));
+        }
         self.fix_cameras()?;
         self.receiver()?;
         if self.cameras.len() > MAX_CAMERAS {
@@ -444,6 +449,14 @@ impl SourceSettings {
             checked().map_err(|error: Error| error.under(&format!("cameras.{name}")))?;
         }
         Ok(())
+    }
+
+    /// True if a message is answered when it was taken, before what is to be stored of it is stored: applications of
+    /// phones send a position only after the answer to the one before, and a fix may wait seconds for its box.
+    #[must_use]
+    pub fn answers_at_once(&self) -> bool {
+        let is_pushed = self.address().is_ok_and(|address| address.scheme == Scheme::Push);
+        is_pushed && self.format == MessageFormat::Phone
     }
 
     /// True if its messages contain fixes, not detections.

@@ -36,7 +36,7 @@ impl FixRow {
         }
         let reason = match format {
             FixFormat::Nmea => "has no date: the file has no RMC or ZDA sentence",
-            FixFormat::Csv | FixFormat::Gpx | FixFormat::Gpsd | FixFormat::Rtklib => "is required",
+            _ => "is required",
         };
         Err(RowError { line, field: "time".to_owned(), reason: reason.to_owned() })
     }

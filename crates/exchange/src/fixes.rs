@@ -1,6 +1,6 @@
 //! Files of fixes: for estimating a receiver's error, and for pairing.
 
-use std::io::Read;
+use std::io::{BufRead as _, BufReader, Read};
 
 use jiff::Timestamp;
 
@@ -8,8 +8,10 @@ use super::columns::{LATITUDE, LONGITUDE};
 use super::csv_layout::LaidOut;
 use super::csv_rows::CsvRows;
 use super::file_row::{FileRow, RowError, shared};
+use super::fit::FitFixes;
 use super::fix_row::FixRow;
 use super::format::FixFormat;
+use super::gnss_logger::GnssLoggerFixes;
 use super::gpsd::GpsdFixes;
 use super::gpx::GpxFixes;
 use super::nmea_fixes::NmeaFixes;
@@ -66,11 +68,15 @@ enum FixRows<R> {
     Gpx(Box<GpxFixes<R>>),
     Gpsd(GpsdFixes<R>),
     Rtklib(RtklibFixes<R>),
+    Fit(Box<FitFixes<R>>),
+    GnssLogger(GnssLoggerFixes<R>),
 }
 
-impl<R: Read> FixRows<R> {
+impl<R: Read> FixRows<BufReader<R>> {
     fn new(reader: R, laid_out: &LaidOut<FixFormat>, time_bounds: TimeBounds) -> Result<Self> {
-        Ok(match laid_out.format {
+        let mut reader = BufReader::new(reader);
+        let beginning = reader.fill_buf().map_err(Error::fault)?;
+        Ok(match laid_out.format.of_content(beginning) {
             FixFormat::Csv => {
                 let rows = CsvRows::with_receivers(reader, &[LONGITUDE, LATITUDE], &laid_out.layout)?;
                 Self::Csv { rows, time_bounds, receiver_id: None }
@@ -79,6 +85,8 @@ impl<R: Read> FixRows<R> {
             FixFormat::Gpx => Self::Gpx(Box::new(GpxFixes::new(reader, time_bounds))),
             FixFormat::Gpsd => Self::Gpsd(GpsdFixes::new(reader, time_bounds)),
             FixFormat::Rtklib => Self::Rtklib(RtklibFixes::new(reader, time_bounds)),
+            FixFormat::Fit => Self::Fit(Box::new(FitFixes::new(reader, time_bounds))),
+            FixFormat::GnssLogger => Self::GnssLogger(GnssLoggerFixes::new(reader, time_bounds)),
         })
     }
 
@@ -93,6 +101,8 @@ impl<R: Read> FixRows<R> {
             Self::Gpx(rows) => rows.next_row(),
             Self::Gpsd(rows) => rows.next_row(),
             Self::Rtklib(rows) => rows.next_row(),
+            Self::Fit(rows) => rows.next_row(),
+            Self::GnssLogger(rows) => rows.next_row(),
         }
     }
 }

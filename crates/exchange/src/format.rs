@@ -78,14 +78,18 @@ pub enum FixFormat {
     Gpsd,
     /// Solutions of RTKLIB (`.pos`) in degrees, with times of GPS, UTC or Japan.
     Rtklib,
+    /// Activities of sports watches and bicycle computers (`.fit`): the messages `record`.
+    Fit,
+    /// Logs of Android's GnssLogger: the lines `Fix` of the provider `gps`.
+    GnssLogger,
 }
 
 impl FixFormat {
     /// All formats.
     pub const ALL: &'static [Self] = Self::VARIANTS;
 
-    /// The format of a file's extension; `nmea`, `log` and `txt` are NMEA; `json`,
-    /// `ndjson` and `jsonl` are gpsd's.
+    /// The format of a file's extension; `nmea`, `log` and `txt` are NMEA ([`FixFormat::of_content`] tells logs of
+    /// GnssLogger from it); `json`, `ndjson` and `jsonl` are gpsd's.
     #[must_use]
     pub fn from_path(path: &std::path::Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
@@ -94,6 +98,7 @@ impl FixFormat {
             "nmea" | "log" | "txt" => Some(Self::Nmea),
             "gpx" => Some(Self::Gpx),
             "pos" => Some(Self::Rtklib),
+            "fit" => Some(Self::Fit),
             "json" | "ndjson" | "jsonl" => Some(Self::Gpsd),
             _ => None,
         }
@@ -108,11 +113,19 @@ impl FixFormat {
             "application/nmea" | "application/x-nmea" | "text/x-nmea" | "text/plain" => Some(Self::Nmea),
             "application/gpx+xml" => Some(Self::Gpx),
             "text/x-rtklib" => Some(Self::Rtklib),
+            "application/vnd.ant.fit" | "application/fit" => Some(Self::Fit),
             "application/json" | "application/x-ndjson" | "application/ndjson" | "application/jsonl" => {
                 Some(Self::Gpsd)
             }
             _ => None,
         }
+    }
+
+    /// The format of a file that is named as of this one and begins so: a log of GnssLogger is named as text and begins
+    /// with a comment, which NMEA does not have.
+    #[must_use]
+    pub fn of_content(self, beginning: &[u8]) -> Self {
+        if self == Self::Nmea && beginning.starts_with(b"#") { Self::GnssLogger } else { self }
     }
 
     /// Name in commands and reports.
@@ -123,5 +136,5 @@ impl FixFormat {
 }
 
 fn unknown_fix_format(_: &str) -> Error {
-    Error::invalid("format", "must be one of csv, nmea, gpx, gpsd, rtklib")
+    Error::invalid("format", "must be one of csv, nmea, gpx, gpsd, rtklib, fit, gnss_logger")
 }

@@ -3,16 +3,16 @@
 //! Read as a stream of XML events in bounded memory: a tag or text has at most 64 KiB, and elements are
 //! nested at most 64 deep. Entities are not expanded and nothing is fetched.
 
-use std::io::{self, BufRead, BufReader, Read};
+use std::io::{self, Read};
 
 use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
-use super::MAX_ROW_BYTES;
 use super::file_row::RowError;
 use super::fix_quality::Solution;
 use super::fix_row::FixRow;
 use super::wire;
+use super::xml::BoundedReader;
 use crate::domain::{Error, ErrorKind, Fix, Result, SigmaM, TimeBounds, parse_time};
 
 /// Largest nesting depth of elements.
@@ -77,9 +77,8 @@ enum PointEvent {
 
 impl<R: Read> GpxFixes<R> {
     pub(super) fn new(reader: R, time_bounds: TimeBounds) -> Self {
-        let source = BoundedReader { reader: BufReader::new(reader), line: 1, event_bytes: 0 };
         Self {
-            reader: Reader::from_reader(source),
+            reader: Reader::from_reader(BoundedReader::new(reader)),
             buffer: Vec::new(),
             time_bounds,
             depth: 0,
@@ -105,12 +104,12 @@ impl<R: Read> GpxFixes<R> {
 
     fn next_event(&mut self) -> Result<PointEvent> {
         self.buffer.clear();
-        self.reader.get_mut().event_bytes = 0;
+        self.reader.get_mut().begin_event();
         let in_child = self.point.as_ref().is_some_and(|point| point.child.is_some());
         let event = self.reader.read_event_into(&mut self.buffer);
         Ok(match event {
-            Ok(Event::Start(tag)) => opened(&tag, self.reader.get_ref().line, self.depth, false),
-            Ok(Event::Empty(tag)) => opened(&tag, self.reader.get_ref().line, self.depth, true),
+            Ok(Event::Start(tag)) => opened(&tag, self.reader.get_ref().line(), self.depth, false),
+            Ok(Event::Empty(tag)) => opened(&tag, self.reader.get_ref().line(), self.depth, true),
             Ok(Event::End(_)) => PointEvent::Close,
             Ok(Event::Text(text)) if in_child => PointEvent::Text(text.to_string()),
             Ok(Event::Eof) => PointEvent::End,
@@ -176,7 +175,7 @@ impl<R: Read> GpxFixes<R> {
     }
 
     fn malformed(&self, reason: &str) -> Error {
-        let line = self.reader.get_ref().line;
+        let line = self.reader.get_ref().line();
         Error::refused(ErrorKind::MalformedBody, format!("line {line}: {reason}"))
     }
 }
@@ -241,37 +240,4 @@ fn fix_of(tag: &BytesStart<'_>, line: u64) -> std::result::Result<Fix, RowError>
         let is_latitude = cause.to_string().starts_with("latitude");
         error(if is_latitude { "lat" } else { "lon" }, &cause.to_string())
     })
-}
-
-/// Counts lines and limits the bytes of one event.
-struct BoundedReader<R> {
-    reader: BufReader<R>,
-    line: u64,
-    /// Bytes consumed since the latest event.
-    event_bytes: usize,
-}
-
-impl<R: Read> Read for BoundedReader<R> {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let consumed = self.fill_buf()?.read(buffer)?;
-        self.consume(consumed);
-        Ok(consumed)
-    }
-}
-
-impl<R: Read> BufRead for BoundedReader<R> {
-    fn fill_buf(&mut self) -> io::Result<&[u8]> {
-        if self.event_bytes > MAX_ROW_BYTES {
-            let reason = "a tag or text is longer than 64 KiB";
-            return Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
-        }
-        self.reader.fill_buf()
-    }
-
-    fn consume(&mut self, consumed: usize) {
-        let lines = self.reader.buffer().iter().take(consumed).filter(|&&byte| byte == b'\n').count();
-        self.line += lines as u64;
-        self.event_bytes += consumed;
-        self.reader.consume(consumed);
-    }
 }

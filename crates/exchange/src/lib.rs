@@ -29,12 +29,14 @@ mod cursor;
 mod elements;
 mod feature;
 mod file_row;
+mod fit;
 mod fix_quality;
 mod fix_row;
 mod fixes;
 mod format;
 mod formula_guard;
 mod frame_files;
+mod gnss_logger;
 mod gpsd;
 mod gpx;
 mod home_assistant;
@@ -55,6 +57,7 @@ mod track_files;
 mod unix_time;
 pub mod wire;
 mod write;
+mod xml;
 
 pub use address::{Address, Scheme, SerialLine, bracketed};
 pub use connection::{

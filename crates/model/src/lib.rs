@@ -12,7 +12,8 @@
 //! | [`network`] | shape, forward pass, loss and gradient kernels, optimiser, training loop |
 //! | `samples` | training rows in a plane, traverses, held-out targets and blocks of time; boxes without a fix; noise of the fixes and its whitening filter |
 //! | `progress` | observer and progress of a fit |
-//! | `encoder` | one encoder per recipe, the auto-encoder that two of them have; the projective map and its robust fit; `gaussian_process`, a folder with its own fit, covariance and leave-out |
+//! | `encoder` | what recipes share: the features of a box, the auto-encoder, the projective map and its robust fit |
+//! | `recipes` | the table of recipes; a folder per recipe with its fit, its encoder and the encoder as expressions of a graph |
 //! | `site` | the cameras of a site trained together: one least-squares problem, the error that they have in common |
 //! | `uncertainty` | coverage, local box model, error model; their calibration by variance components |
 //! | `regressor` | a loaded model: encoder and error model |
@@ -35,6 +36,7 @@ pub mod network;
 mod onnx;
 mod probe;
 mod progress;
+mod recipes;
 mod regressor;
 mod samples;
 mod site;
@@ -43,7 +45,6 @@ mod view_area;
 
 pub use crate::statistics::R95_PER_SIGMA;
 pub use artifact::{Artifact, FORMAT, LARGEST_WEIGHTS_BYTES, TrackNoiseModel};
-pub use encoder::gaussian_process::{GroundCamera, GroundPoint, HiddenFoot, RecentBoxes};
 pub use encoder::projection::Projection;
 pub use encoder::projection_fit::fit_foot_points;
 pub use fitting::{
@@ -51,6 +52,7 @@ pub use fitting::{
     estimate_gnss_noise, fit, fit_site_models, fit_with,
 };
 pub use progress::{FitError, FitEvent};
+pub use recipes::gaussian_process::{GroundCamera, GroundPoint, HiddenFoot, RecentBoxes};
 pub use regressor::{JointError, Regression, Regressor};
 pub use samples::mirroring::{FootPosition, is_mirrored, median_position};
 pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};

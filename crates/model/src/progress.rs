@@ -95,6 +95,17 @@ pub(crate) struct Phase<'r, 'a> {
 }
 
 impl Phase<'_, '_> {
+    /// Reports work of the phase that took as long as some epochs; none at its beginning.
+    pub(crate) fn advance(&mut self, epochs: u32) -> Result<(), FitError> {
+        let Self { run, name, .. } = self;
+        run.progress.phase.clone_from(name);
+        run.progress.epoch += epochs;
+        match (run.observer)(FitEvent::Progress(&run.progress)) {
+            ControlFlow::Continue(()) => Ok(()),
+            ControlFlow::Break(()) => Err(FitError::Cancelled),
+        }
+    }
+
     /// Trains a network from initial parameters; `part` names the network if the phase has several.
     /// Returns the parameters and the sums of the last epoch.
     pub(crate) fn train(

@@ -1,11 +1,13 @@
 //! A loaded model: from a box to a position with its error, without allocation.
 
+use std::sync::Arc;
+
 use super::artifact::{ModelParts, TrackNoiseModel};
-use super::encoder::Encoder;
-use super::encoder::features::{Encoded, reconstruction_error};
-use super::encoder::gaussian_process::{HiddenFoot, RecentBoxes};
+use super::encoder::{Encoder, ErrorContext, Estimate};
+use super::recipes::gaussian_process::{HiddenFoot, RecentBoxes};
+use super::recipes::{self, ErrorSource};
 use super::site::JointMap;
-use super::uncertainty::error_model::{BoxError, ErrorModel};
+use super::uncertainty::error_model::ErrorModel;
 use super::uncertainty::scene::{Limited, Scene};
 use crate::domain::{BoundingBox, ImageSize, Result, RunId};
 use crate::geo::{EastNorth, LocalPlane, PLANE_RANGE_M, PlaneCovariance};
@@ -131,7 +133,7 @@ pub struct Regressor {
     pub(super) scene: Option<Scene>,
     frozen_after_s: f64,
     pub(super) error_model: ErrorModel,
-    pub(super) encoder: Encoder,
+    pub(super) encoder: Arc<dyn Encoder>,
     joint_map: Option<JointMap>,
 }
 
@@ -139,8 +141,9 @@ impl Regressor {
     /// # Errors
     /// Names the tensor or metadata field that is missing, unknown or cannot be used.
     pub(super) fn build(mut parts: ModelParts) -> Result<Self> {
-        let error_model = ErrorModel::build(&mut parts)?;
-        let encoder = Encoder::build(&mut parts)?;
+        let is_formula = recipes::error_source(parts.recipe) == ErrorSource::Formula;
+        let error_model = ErrorModel::build(&mut parts, is_formula)?;
+        let encoder = recipes::load(&mut parts)?;
         let joint_map = JointMap::take(&mut parts)?;
         let r95_scale = parts.positive_parameter("r95_scale")?;
         let track_noise = TrackNoiseModel::read(&parts)?;
@@ -243,8 +246,8 @@ impl Regressor {
 
     /// True if the regressed position depends on the fix: a network of `paper` has it among its inputs.
     #[must_use]
-    pub const fn uses_fix(&self) -> bool {
-        matches!(self.encoder, Encoder::Paper(_))
+    pub fn uses_fix(&self) -> bool {
+        self.encoder.uses_fix()
     }
 
     /// How the error of a box's position divides among cameras that were trained together. `None` for a camera that
@@ -296,10 +299,7 @@ impl Regressor {
     /// places are correlated; only `gaussian_process` does.
     #[must_use]
     pub fn displacement_covariance(&self, boxes: [&BoundingBox; 2]) -> Option<PlaneCovariance> {
-        match &self.encoder {
-            Encoder::GaussianProcess(map) => Some(map.displacement_covariance(boxes)),
-            Encoder::Paper(_) | Encoder::Hybrid(_) | Encoder::Projective(_) => None,
-        }
+        self.encoder.displacement_covariance(boxes)
     }
 
     /// Returns the completed boxes if something hides the lower part of a box. Only a model of the recipe
@@ -312,12 +312,7 @@ impl Regressor {
         bounding_box: &BoundingBox,
         recent: Option<&mut RecentBoxes>,
     ) -> Option<HiddenFoot> {
-        match &self.encoder {
-            Encoder::GaussianProcess(map) => {
-                HiddenFoot::of(bounding_box, &map.predictor.plausibility, recent)
-            }
-            Encoder::Paper(_) | Encoder::Hybrid(_) | Encoder::Projective(_) => None,
-        }
+        self.encoder.hidden_foot(bounding_box, recent)
     }
 
     /// The answer for a box whose foot may be hidden: the mixture of `seen`, the answer for the box as it is, with those
@@ -338,33 +333,15 @@ impl Regressor {
         fix: Option<EastNorth>,
         recent: Option<&mut RecentBoxes>,
     ) -> Regression {
-        let mut r95_scale = self.r95_scale;
-        let mut stated = None;
-        let (regressed, error, extrapolation_ratio) = match &self.encoder {
-            Encoder::Paper(paper) => {
-                let estimate = paper.estimate(&self.plane, bounding_box, fix);
-                let (reconstruction_error, variance_m2) =
-                    (estimate.reconstruction_error, estimate.variance_m2);
-                let error = BoxError { reconstruction_error, variance_m2 };
-                (estimate.position, error, self.error_model.extrapolation_ratio(bounding_box))
-            }
-            Encoder::Hybrid(hybrid) => self.with_error(bounding_box, hybrid.encode(bounding_box)),
-            Encoder::Projective(projective) => self.with_error(bounding_box, projective.encode(bounding_box)),
-            Encoder::GaussianProcess(map) => {
-                // Its error comes with every answer, not from the error model.
-                let estimate = map.estimate(bounding_box, recent);
-                r95_scale = estimate.r95_scale;
-                let reconstruction_error = reconstruction_error(bounding_box, &estimate.encoded);
-                stated = Some((estimate.covariance, estimate.box_noise));
-                let variance_m2 = estimate.covariance.per_axis_m2();
-                let error = BoxError { reconstruction_error, variance_m2 };
-                (estimate.encoded.position, error, self.error_model.extrapolation_ratio(bounding_box))
-            }
+        let context = ErrorContext {
+            plane: &self.plane,
+            error_model: &self.error_model,
+            r95_scale: self.r95_scale,
+            white_share: self.white_share,
         };
-        let (covariance, box_noise) = stated.unwrap_or_else(|| {
-            let isotropic = PlaneCovariance::isotropic(error.variance_m2);
-            (isotropic, isotropic.scaled(self.white_share))
-        });
+        let estimate = self.encoder.estimate(&context, bounding_box, fix, recent);
+        let Estimate { position: regressed, covariance, box_noise, extrapolation_ratio, r95_scale, .. } =
+            estimate;
         let unlimited = || Limited { position: regressed, covariance, factor: 1.0 };
         let Limited { position: regressed, covariance, factor } =
             self.scene.map_or_else(unlimited, |scene| {
@@ -377,22 +354,14 @@ impl Regressor {
         let covariance = covariance.plus(PlaneCovariance::isotropic(e_regression_m2 - variance_m2));
         Regression {
             regressed,
-            reconstruction_error: error.reconstruction_error,
+            reconstruction_error: estimate.reconstruction_error,
             e_regression_m2,
             covariance,
             box_noise,
             outside_training: self
                 .error_model
-                .is_outside_training(extrapolation_ratio, error.reconstruction_error),
+                .is_outside_training(extrapolation_ratio, estimate.reconstruction_error),
             r95_scale,
         }
-    }
-
-    /// Position, its error by the error model, and the extrapolation ratio.
-    #[inline]
-    fn with_error(&self, bounding_box: &BoundingBox, encoded: Encoded) -> (EastNorth, BoxError, f64) {
-        let lookup = self.error_model.look_up(bounding_box);
-        let error = self.error_model.error_of(bounding_box, &lookup, &encoded);
-        (encoded.position, error, lookup.extrapolation_ratio)
     }
 }

@@ -160,7 +160,7 @@ contract! {
     /// [`ErrorKind::CameraNotFound`].
     fn samples(&self, id: &CameraId, filter: &SampleFilter, after: Option<SampleKey>, limit: u32) -> Result<Vec<StoredSample>>;
 
-    /// At most so many of the boxes without a fix that a filter selects, in order of time and target. Of
+    /// At most `most` of the boxes without a fix that a filter selects, in order of time and target. Of
     /// more, one of every few consecutive ones is taken, at a place that changes from few to few, so that
     /// none of several simultaneous targets is preferred.
     ///
@@ -180,7 +180,7 @@ contract! {
     /// [`ErrorKind::CameraNotFound`].
     fn count_truths(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64>;
 
-    /// Time of the sample with a fix that has so many before it, in order of time; `None` after the last.
+    /// Time of the sample with a fix that has this number before it, in order of time; `None` after the last.
     ///
     /// # Errors
     /// [`ErrorKind::CameraNotFound`].

@@ -2,7 +2,7 @@
 //!
 //! Tables are copied with the columns that they have, so a new column needs nothing here; a new table needs a line in
 //! [`TABLES`]. The source is read in one transaction, and the target is written in one, so that a copy is complete or
-//! leaves nothing behind.
+//! leaves nothing.
 
 use futures_util::future::BoxFuture;
 use sha2::{Digest as _, Sha256};

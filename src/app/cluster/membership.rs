@@ -12,7 +12,7 @@ use super::camera_lease::{CameraLease, HeldLease, between_nodes, camera_text};
 use super::connection_lease::HeldConnection;
 use super::history::HistoryWatch;
 use super::registration::Registration;
-use super::watches::Watches;
+use super::watches::{Watched, Watches};
 use crate::app::App;
 use crate::app::live::sync::lock;
 use crate::app::registry::ActiveCamera;
@@ -115,10 +115,8 @@ impl Membership {
                 if is_takeover {
                     app.metrics.camera_taken_over();
                 }
-                if app.registry.begin_tenure(&camera.id, camera.key, fence).await
-                    && let Some(site) = camera.site.as_ref().filter(|site| !self.holds_camera_of(site))
-                {
-                    app.site_registry.reset(&app.store, site).await?;
+                if app.registry.begin_tenure(&camera.id, camera.key, fence).await {
+                    self.clear_site(app, camera).await?;
                 }
                 Ok(self.hold(HeldLease::new(camera, fence, registration, now)))
             }
@@ -127,6 +125,37 @@ impl Membership {
             }
             Acquired::NotRegistered => Err(between_nodes(&camera_text(&camera.id))),
         }
+    }
+
+    /// Clears the live state of what other nodes have owned since this one did: of a camera or of all of a site, and
+    /// that of the site.
+    ///
+    /// # Errors
+    /// The database does not answer.
+    pub(super) async fn clear_former(&self, app: &App, read: Watched) -> Result<()> {
+        let fences = match read {
+            Watched::Camera(key) => self.leases.latest_fences(Some(key), None).await?,
+            Watched::Site(key) => self.leases.latest_fences(None, Some(key)).await?,
+        };
+        for (key, fence) in fences {
+            if let Some(camera) = app.registry.clear_before(key, fence).await {
+                self.clear_site(app, &camera).await?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Clears the live state of the site of a camera whose own was cleared.
+    async fn clear_site(&self, app: &App, camera: &ActiveCamera) -> Result<()> {
+        match camera.site.as_ref().filter(|site| !self.holds_camera_of(site)) {
+            Some(site) => app.site_registry.reset(&app.store, site).await,
+            None => Ok(()),
+        }
+    }
+
+    /// True if this node surely owns a camera; does not count as a use of its lease.
+    pub(super) fn holds(&self, key: CameraKey, now: Duration) -> bool {
+        lock(&self.held).get(&key).is_some_and(|lease| lease.is_valid(now))
     }
 
     /// The lease of a camera that this node surely owns.

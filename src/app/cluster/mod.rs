@@ -143,7 +143,8 @@ impl App {
         Ok((self.active_camera(id).await?, lease))
     }
 
-    /// Checks that the live state of a camera may be read here: this node owns it, or no other does.
+    /// Checks that the live state of a camera may be read here: this node owns it, or no other does. What is older than
+    /// the latest owner's is cleared.
     ///
     /// # Errors
     /// `CameraOnOtherNode`, `CameraBetweenNodes`.
@@ -153,7 +154,13 @@ impl App {
             return Ok(());
         }
         let owner = membership.leases.camera_owner(camera.key).await?;
-        self.check_owner(membership, &camera_text(&camera.id), owner)
+        self.check_owner(membership, &camera_text(&camera.id), owner)?;
+        membership.clear_former(self, Watched::Camera(camera.key)).await
+    }
+
+    /// True if this node surely owns a camera.
+    pub(super) fn owns_camera(&self, camera: &ActiveCamera) -> bool {
+        self.cluster.membership().is_none_or(|it| it.holds(camera.key, self.clock.monotonic()))
     }
 
     /// Checks that the live state of a site may be read here.
@@ -163,7 +170,8 @@ impl App {
     pub(super) async fn check_site_readable(&self, id: &SiteId, site: SiteKey) -> Result<()> {
         let Some(membership) = self.cluster.membership() else { return Ok(()) };
         let owner = membership.leases.site_owner(site).await?;
-        self.check_owner(membership, &format!("site {id}"), owner)
+        self.check_owner(membership, &format!("site {id}"), owner)?;
+        membership.clear_former(self, Watched::Site(site)).await
     }
 
     fn check_owner(&self, membership: &Membership, owned: &str, owner: Option<NodeId>) -> Result<()> {

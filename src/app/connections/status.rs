@@ -60,7 +60,7 @@ pub struct CountedReason {
     pub reason: String,
     /// Number of messages or parts.
     pub count: u64,
-    /// The latest example: an item in words, or the beginning of a message.
+    /// The latest example: an item in words, or the beginning of the message.
     pub example: String,
     /// When that came.
     pub last_at: Timestamp,

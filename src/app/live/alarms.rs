@@ -135,7 +135,7 @@ impl App {
         self.registry.refresh_camera(&self.store, id).await?;
         if is_new {
             tracing::warn!(
-                camera.id = %id, model = moved.model_version, began_at = %moved.began_at,
+                camera.id = %id, model = moved.model_version, onset_at = %moved.onset_at,
                 shift_east_m = moved.shift_east_m, shift_north_m = moved.shift_north_m,
                 "the camera's pose has changed since its model was trained"
             );

@@ -112,6 +112,11 @@ impl CameraLive {
         before == 0 || before + 1 == fence
     }
 
+    /// True if a later tenure than that of this state has begun.
+    pub(in crate::app) fn is_before(&self, fence: i64) -> bool {
+        (1..fence).contains(&self.tenure.load(Ordering::Acquire))
+    }
+
     /// Ends the readers of a state that another one replaces.
     pub(in crate::app) fn replace(&self) {
         self.replaced.cancel();

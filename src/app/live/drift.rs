@@ -51,7 +51,7 @@ impl DriftMonitor {
 fn camera_moved(model_version: u32, alarm: &DriftAlarm) -> CameraMoved {
     CameraMoved {
         model_version,
-        began_at: alarm.onset_at,
+        onset_at: alarm.onset_at,
         raised_at: alarm.detected_at,
         shift_east_m: alarm.shift.east_m,
         shift_north_m: alarm.shift.north_m,

@@ -196,9 +196,10 @@ impl App {
 
     /// Returns the activity in a camera's view.
     pub(super) fn activity(&self, camera: &ActiveCamera) -> CameraActivity {
-        let observed = camera.live.latest_observed();
+        let (observed, tracks) = (camera.live.latest_observed(), &camera.live.tracks);
         CameraActivity {
-            targets: camera.live.tracks.latest(self.clock.monotonic()).len(),
+            // A former owner does not know what the present one sees.
+            targets: if self.owns_camera(camera) { tracks.latest(self.clock.monotonic()).len() } else { 0 },
             streams: camera.live.open_streams(),
             last_observed_at: observed.last_at,
             frozen_since: observed.frozen_since,
@@ -242,7 +243,8 @@ impl App {
     pub(super) async fn readable_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
         let camera = self.active_camera(id).await?;
         self.check_readable(&camera).await?;
-        Ok(camera)
+        // Its live state may be a new one.
+        self.active_camera(id).await
     }
 
     /// Everything that happens in a camera's view from now on, or after the last event that the reader has

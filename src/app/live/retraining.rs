@@ -74,8 +74,8 @@ impl App {
             // The camera still answers by the version that no longer fits.
             None | Some(JobState::Failed | JobState::Succeeded) => {}
         }
-        let request = RunRequest { from: Some(moved.began_at), ..RunRequest::default() };
-        match self.start_run(id, request, None).await {
+        let request = RunRequest { from: Some(moved.onset_at), ..RunRequest::default() };
+        match self.training().start(id, request, None).await {
             Ok(run) => {
                 self.store.note_retraining(id, moved.model_version, run.id).await?;
                 tracing::info!(camera.id = %id, run.id = %run.id, "training again, because the camera was moved");

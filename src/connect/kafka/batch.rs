@@ -61,12 +61,12 @@ impl Batch {
         Ok(Self { base_offset, last_offset, attributes, record_count, records: batch.0, format })
     }
 
-    /// Whether its records are those of transactions, and not of producers.
+    /// True if its records are those of transactions, not of producers.
     pub(super) const fn is_control(&self) -> bool {
         self.attributes & CONTROL_BIT != 0
     }
 
-    /// The records, decompressed to at most so many bytes.
+    /// The records, decompressed to at most `most_bytes`.
     ///
     /// # Errors
     /// Why they cannot be read.

@@ -37,7 +37,7 @@ struct User {
     password: String,
 }
 
-/// What opens connections to the brokers of a cluster.
+/// Opens connections to the brokers of a cluster.
 pub(super) struct Dialer {
     client_id: String,
     tls: Option<Arc<ClientConfig>>,

@@ -5,7 +5,7 @@ use std::io::Read;
 use flate2::read::MultiGzDecoder;
 use lz4_flex::frame::FrameDecoder;
 
-/// What batches are compressed with.
+/// The compression of a batch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, strum::Display)]
 #[strum(serialize_all = "lowercase")]
 pub(super) enum Codec {
@@ -44,7 +44,7 @@ impl From<snap::Error> for Undecoded {
     }
 }
 
-/// Decompresses to at most so many bytes; what would become more is not decompressed further.
+/// Decompresses to at most `most_bytes`; fails when the content would become larger.
 ///
 /// # Errors
 /// It is larger, or damaged.

@@ -33,7 +33,7 @@ impl ErrorCode {
         matches!(self, Self::UNKNOWN_TOPIC_OR_PARTITION | Self::LEADER_NOT_AVAILABLE)
     }
 
-    /// What is written is at fault, so that the broker will never take it.
+    /// True if the written content is at fault, so that the broker will never accept it.
     pub(super) const fn is_refusal(self) -> bool {
         // Too large a message or batch, an invalid topic, timestamp or record.
         matches!(self.0, 10 | 17 | 18 | 32 | 87)

@@ -10,50 +10,10 @@ use hyper::header::{CONTENT_TYPE, IntoHeaderName, LOCATION};
 use hyper::http::HeaderValue;
 use jiff::Timestamp;
 use serde::de::{MapAccess, Visitor};
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserializer, Serialize};
 use utoipa::ToSchema;
 
 use crate::domain::{self, Error, MAX_LABELS, Result, parse_time};
-
-/// How a camera is learnt.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub(in crate::http) enum Recipe {
-    /// The paper to the letter.
-    Paper,
-    /// The hybrid loss in metres, on scaled inputs.
-    Hybrid,
-    /// A learnt homography with a small residual network.
-    Projective,
-    /// A projective map with a Gaussian-process residual; its stated error counts receivers, not rows.
-    GaussianProcess,
-    /// The best of the candidates on held-out blocks of time.
-    Auto,
-}
-
-impl From<Recipe> for crate::domain::Recipe {
-    fn from(recipe: Recipe) -> Self {
-        match recipe {
-            Recipe::Paper => Self::Paper,
-            Recipe::Hybrid => Self::Hybrid,
-            Recipe::Projective => Self::Projective,
-            Recipe::GaussianProcess => Self::GaussianProcess,
-            Recipe::Auto => Self::Auto,
-        }
-    }
-}
-
-impl From<crate::domain::Recipe> for Recipe {
-    fn from(recipe: crate::domain::Recipe) -> Self {
-        match recipe {
-            crate::domain::Recipe::Paper => Self::Paper,
-            crate::domain::Recipe::Hybrid => Self::Hybrid,
-            crate::domain::Recipe::Projective => Self::Projective,
-            crate::domain::Recipe::GaussianProcess => Self::GaussianProcess,
-            crate::domain::Recipe::Auto => Self::Auto,
-        }
-    }
-}
 
 /// Reads labels. More than there may be are not kept while they are read.
 pub(in crate::http) fn labels<'de, D: Deserializer<'de>>(

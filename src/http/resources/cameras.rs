@@ -11,7 +11,9 @@ use utoipa_axum::routes;
 
 use super::receivers::{Receiver, receivers, shown};
 use crate::app::App;
-use crate::domain::{self, CameraId, Error, GnssBiasSigma, NewCamera, Result, SigmaM, SiteId, TargetClass};
+use crate::domain::{
+    self, CameraId, Error, GnssBiasSigma, NewCamera, Recipe, Result, SigmaM, SiteId, TargetClass,
+};
 use crate::exchange::wire::{Position, parse_document};
 use crate::exchange::write_cursor;
 use crate::http::plumbing::access::CallerApp;
@@ -20,7 +22,7 @@ use crate::http::plumbing::extract::{CameraPath, JsonBody, Params, site_of};
 use crate::http::plumbing::merge_patch::{self, JsonObject};
 use crate::http::plumbing::problem::{ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
-use crate::http::plumbing::wire::{Recipe, created, empty, json};
+use crate::http::plumbing::wire::{created, empty, json};
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new().routes(routes!(create_camera, list_cameras)).routes(routes!(
@@ -164,7 +166,7 @@ impl CameraDraft {
             gnss_error: self.gnss_error.map_or(Ok(blank.gnss_error), GnssError::to_domain)?,
             location: location.map_err(|error| error.under("location"))?,
             gnss_bias_sigma: self.gnss_bias_sigma_m.map(GnssBiasSigma::new).transpose()?,
-            recipe: self.recipe.map_or(blank.recipe, domain::Recipe::from),
+            recipe: self.recipe.unwrap_or(blank.recipe),
             target_classes: classes(&self.target_classes)?,
             labels: self.labels,
             receivers: receivers(&self.receivers)?,
@@ -297,8 +299,8 @@ pub(super) struct Camera {
 impl Camera {
     pub(super) fn of(app: &App, camera: domain::Camera) -> Self {
         let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
-        let model_fault = app.model_fault(camera.id()).map(|fault| fault.reason);
-        let warnings = app.camera_warnings(&camera);
+        let model_fault = app.models().fault(camera.id()).map(|fault| fault.reason);
+        let warnings = app.cameras().warnings(&camera);
         let domain::Camera { profile, revision, created_at, updated_at, active_model, samples, key: _ } =
             camera;
         Self {
@@ -310,7 +312,7 @@ impl Camera {
             gnss_error: profile.gnss_error.into(),
             location: profile.location.map(Into::into),
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
-            recipe: profile.recipe.into(),
+            recipe: profile.recipe,
             target_classes: profile.target_classes.iter().map(|class| class.as_str().to_owned()).collect(),
             labels: profile.labels,
             receivers: shown(&profile.receivers),
@@ -337,9 +339,9 @@ impl Camera {
 pub(super) struct CameraMoved {
     /// Number of the model version that no longer fits.
     model_version: u32,
-    /// When it began, as well as it can be estimated.
+    /// Estimated onset of the change.
     #[schema(value_type = String, format = DateTime)]
-    began_at: Timestamp,
+    onset_at: Timestamp,
     /// When the evidence was enough.
     #[schema(value_type = String, format = DateTime)]
     raised_at: Timestamp,
@@ -355,9 +357,9 @@ pub(super) struct CameraMoved {
 
 impl From<&domain::CameraMoved> for CameraMoved {
     fn from(moved: &domain::CameraMoved) -> Self {
-        let &domain::CameraMoved { model_version, began_at, raised_at, .. } = moved;
+        let &domain::CameraMoved { model_version, onset_at, raised_at, .. } = moved;
         let &domain::CameraMoved { shift_east_m, shift_north_m, statistic, targets, .. } = moved;
-        Self { model_version, began_at, raised_at, shift_east_m, shift_north_m, statistic, targets }
+        Self { model_version, onset_at, raised_at, shift_east_m, shift_north_m, statistic, targets }
     }
 }
 
@@ -381,7 +383,7 @@ struct CameraPage {
     )
 )]
 async fn create_camera(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
-    let camera = app.create_camera(body.read::<CameraDraft>()?.into_domain()?).await?;
+    let camera = app.cameras().create(body.read::<CameraDraft>()?.into_domain()?).await?;
     let (location, version) = (format!("/v1/cameras/{}", camera.id()), camera.version());
     Ok(with_etag(created(StatusCode::CREATED, &location, &Camera::of(&app, camera))?, version).await?)
 }
@@ -405,7 +407,7 @@ async fn list_cameras(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let after = params.cursor()?;
     let site = params.take("site", site_of)?;
     params.end()?;
-    let page = app.cameras(site.as_ref(), after.as_ref(), limit).await?;
+    let page = app.cameras().list(site.as_ref(), after.as_ref(), limit).await?;
     Ok(json(&CameraPage {
         items: page.items.into_iter().map(|camera| Camera::of(&app, camera)).collect(),
         next_cursor: page.next.map(|id| write_cursor(&id)),
@@ -425,7 +427,7 @@ async fn list_cameras(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     )
 )]
 async fn get_camera(CallerApp(app): CallerApp, CameraPath(id): CameraPath, headers: HeaderMap) -> ApiResult {
-    let camera = app.camera(&id).await?;
+    let camera = app.cameras().get(&id).await?;
     let version = camera.version();
     let response = with_etag(json(&Camera::of(&app, camera))?, version).await?;
     Ok(unless_known(&headers, response))
@@ -458,9 +460,9 @@ async fn change_camera(
     let expected = etag::required(&headers)?;
     let patch = body.read::<JsonObject>()?;
     let change = || async {
-        let camera = app.camera(&id).await?;
+        let camera = app.cameras().get(&id).await?;
         let version = expected.unwrap_or(camera.version());
-        app.change_camera(&id, patched(&app, camera, &patch)?, Some(version)).await
+        app.cameras().change(&id, patched(&app, camera, &patch)?, Some(version)).await
     };
     let changed = merge_patch::retried(expected.is_some(), change).await?;
     let version = changed.version();
@@ -485,6 +487,6 @@ async fn delete_camera(
     CameraPath(id): CameraPath,
     headers: HeaderMap,
 ) -> ApiResult {
-    app.delete_camera(&id, etag::optional(&headers)?).await?;
+    app.cameras().delete(&id, etag::optional(&headers)?).await?;
     Ok(empty())
 }

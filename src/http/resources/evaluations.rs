@@ -9,7 +9,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use crate::app::EvaluationRequest;
-use crate::domain::{self, Error, EvaluationProgress, Method, Result, SigmaM, Truth};
+use crate::domain::{self, Error, EvaluationProgress, Method, Recipe, Result, SigmaM, Truth};
 use crate::evaluation::ReportWithPositions;
 use crate::exchange::wire::Position;
 use crate::exchange::write_cursor;
@@ -18,7 +18,7 @@ use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::extract::{EvaluationPath, JsonBody, Params, camera_of};
 use crate::http::plumbing::problem::{ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
-use crate::http::plumbing::wire::{JobState, Recipe, created, empty, instant, json};
+use crate::http::plumbing::wire::{JobState, created, empty, instant, json};
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new()
@@ -74,7 +74,7 @@ struct EvaluationDraft {
     #[schema(example = json!([[103.98678, 30.62801], [103.98702, 30.62833]]))]
     truth_line: Option<Vec<Vec<f64>>>,
     /// `gnss`, `imm_ukf`, `dnn`, `dnn.denied`, `homography.denied`, `track`, `track.denied`, and of each
-    /// recipe R of `paper`, `hybrid`, `projective`, `auto`: `R.one_step`, `R.two_step`, `R.denied`. If
+    /// recipe R: `R.one_step`, `R.two_step`, `R.denied`. If
     /// left out: all that the profile's recipe gives, without the networks `dnn`.
     #[schema(example = json!(["gnss", "auto.two_step"]))]
     methods: Option<Vec<String>>,
@@ -218,7 +218,7 @@ impl From<domain::EvaluationJob> for Evaluation {
             truth_point,
             truth_line,
             methods: plan.methods.iter().map(Method::to_string).collect(),
-            recipe: plan.recipe.into(),
+            recipe: plan.recipe,
             seeds: plan.seeds,
             box_shift_px: plan.box_shift_px,
             gnss_sigma_m: plan.gnss_sigma.map(SigmaM::metres),
@@ -258,7 +258,7 @@ struct EvaluationPage {
 )]
 async fn start_evaluation(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
     let draft: EvaluationDraft = body.read()?;
-    let job = app.start_evaluation(&camera_of(&draft.camera_id)?, draft.to_domain()?).await?;
+    let job = app.evaluations().start(&camera_of(&draft.camera_id)?, draft.to_domain()?).await?;
     let location = format!("/v1/evaluations/{}", job.id);
     Ok(created(StatusCode::ACCEPTED, &location, &Evaluation::from(job))?)
 }
@@ -282,7 +282,7 @@ async fn list_evaluations(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let limit = params.limit(app.limits.page_items)?;
     let before = params.cursor()?;
     params.end()?;
-    let page = app.evaluations(camera.as_ref(), before, limit).await?;
+    let page = app.evaluations().list(camera.as_ref(), before, limit).await?;
     Ok(json(&EvaluationPage {
         items: page.items.into_iter().map(Evaluation::from).collect(),
         next_cursor: page.next.map(|id| write_cursor(&id)),
@@ -299,7 +299,7 @@ async fn list_evaluations(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     )
 )]
 async fn get_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): EvaluationPath) -> ApiResult {
-    let (job, report) = app.evaluation(id).await?;
+    let (job, report) = app.evaluations().get(id).await?;
     let report = report.map(RawValue::from_string).transpose().map_err(Error::fault)?;
     Ok(json(&Evaluation { report, ..Evaluation::from(job) })?)
 }
@@ -317,7 +317,7 @@ async fn get_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): Evaluatio
     )
 )]
 async fn cancel_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): EvaluationPath) -> ApiResult {
-    Ok(json(&Evaluation::from(app.cancel_evaluation(id).await?))?)
+    Ok(json(&Evaluation::from(app.evaluations().cancel(id).await?))?)
 }
 
 /// Delete an evaluation
@@ -332,6 +332,6 @@ async fn cancel_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): Evalua
     )
 )]
 async fn delete_evaluation(CallerApp(app): CallerApp, EvaluationPath(id): EvaluationPath) -> ApiResult {
-    app.delete_evaluation(id).await?;
+    app.evaluations().delete(id).await?;
     Ok(empty())
 }

@@ -170,7 +170,7 @@ struct KeyPage {
 )]
 async fn create_key(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
     let key = body.read::<KeyDraft>()?.into_domain(app.clock.now())?;
-    let (key, secret) = app.create_key(&key).await?;
+    let (key, secret) = app.keys().create(&key).await?;
     let location = format!("/v1/keys/{}", key.id);
     Ok(created(StatusCode::CREATED, &location, &CreatedKey::new(key, &secret))?)
 }
@@ -191,7 +191,7 @@ async fn list_keys(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let limit = params.limit(app.limits.page_items)?;
     let before = params.cursor()?;
     params.end()?;
-    let page = app.keys(before, limit).await?;
+    let page = app.keys().list(before, limit).await?;
     Ok(json(&KeyPage {
         items: page.items.into_iter().map(Key::from).collect(),
         next_cursor: page.next.map(|id| write_cursor(&id)),
@@ -204,7 +204,7 @@ async fn list_keys(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     responses((status = 200, description = "The key", body = Key))
 )]
 async fn get_key(CallerApp(app): CallerApp, KeyPath(id): KeyPath) -> ApiResult {
-    Ok(json(&Key::from(app.key(id).await?))?)
+    Ok(json(&Key::from(app.keys().get(id).await?))?)
 }
 
 /// Revoke a key
@@ -215,7 +215,7 @@ async fn get_key(CallerApp(app): CallerApp, KeyPath(id): KeyPath) -> ApiResult {
     responses((status = 204, description = "It is revoked"))
 )]
 async fn revoke_key(CallerApp(app): CallerApp, KeyPath(id): KeyPath) -> ApiResult {
-    app.revoke_key(id).await?;
+    app.keys().revoke(id).await?;
     Ok(empty())
 }
 

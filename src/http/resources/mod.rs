@@ -22,6 +22,7 @@ mod openid;
 mod pairings;
 mod pictures;
 mod receivers;
+mod runs;
 mod samples;
 mod server_info;
 mod service;

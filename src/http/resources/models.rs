@@ -101,7 +101,7 @@ async fn list_models(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri:
     let limit = params.limit(app.limits.page_items)?;
     let before = params.cursor()?;
     params.end()?;
-    let page = app.models(&id, before, limit).await?;
+    let page = app.models().list(&id, before, limit).await?;
     Ok(json(&ModelPage {
         items: page.items.into_iter().map(ModelVersion::from).collect(),
         next_cursor: page.next.map(|number| write_cursor(&number)),
@@ -115,7 +115,7 @@ async fn list_models(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri:
     responses((status = 200, description = "The version", body = ModelVersion))
 )]
 async fn get_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPath) -> ApiResult {
-    Ok(json(&ModelVersion::from(app.model(&id, number).await?))?)
+    Ok(json(&ModelVersion::from(app.models().get(&id, number).await?))?)
 }
 
 /// Delete a model version
@@ -130,7 +130,7 @@ async fn get_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPath) 
     )
 )]
 async fn delete_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelPath) -> ApiResult {
-    app.delete_model(&id, number).await?;
+    app.models().delete(&id, number).await?;
     Ok(empty())
 }
 
@@ -173,7 +173,7 @@ async fn download_model(CallerApp(app): CallerApp, ModelPath(id, number): ModelP
     let mut params = Params::of(&uri)?;
     let format = params.take("format", str::parse)?.unwrap_or_default();
     params.end()?;
-    let mut response = Response::new(Body::from(app.download_model(&id, number, format).await?));
+    let mut response = Response::new(Body::from(app.models().download(&id, number, format).await?));
     let name = format!("attachment; filename=\"{id}-{number}.{format}\"");
     let content_type = match format {
         ModelFormat::Safetensors => SAFETENSORS,
@@ -202,7 +202,7 @@ async fn import_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath, req
         return Err(not_read(&readable).into());
     }
     let file = body::whole(&parts.headers, content, app.limits.body_bytes).await?;
-    let model = app.import_model(&id, &file).await?;
+    let model = app.models().import(&id, &file).await?;
     let location = format!("/v1/cameras/{id}/models/{}", model.number);
     Ok(created(StatusCode::CREATED, &location, &ModelVersion::from(model))?)
 }
@@ -216,7 +216,7 @@ async fn import_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath, req
     )
 )]
 async fn get_active_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
-    Ok(json(&ModelVersion::from(app.active_model(&id).await?))?)
+    Ok(json(&ModelVersion::from(app.models().active(&id).await?))?)
 }
 
 /// Activate a model version
@@ -227,8 +227,8 @@ async fn get_active_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath)
 )]
 async fn activate_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath, body: JsonBody) -> ApiResult {
     let Activation { number } = body.read()?;
-    app.activate_model(&id, number).await?;
-    Ok(json(&ModelVersion::from(app.model(&id, number).await?))?)
+    app.models().activate(&id, number).await?;
+    Ok(json(&ModelVersion::from(app.models().get(&id, number).await?))?)
 }
 
 /// Roll back to the version that answered before
@@ -240,6 +240,6 @@ async fn activate_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath, b
     )
 )]
 async fn roll_back_model(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
-    app.roll_back_model(&id).await?;
-    Ok(json(&ModelVersion::from(app.active_model(&id).await?))?)
+    app.models().roll_back(&id).await?;
+    Ok(json(&ModelVersion::from(app.models().active(&id).await?))?)
 }

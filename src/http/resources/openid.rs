@@ -88,7 +88,7 @@ fn answer_person(answer: Result<Response>, headers: &HeaderMap) -> Result<Respon
 }
 
 async fn begin(app: &App) -> Result<Response> {
-    let (secret, url) = app.begin_sign_in().await?;
+    let (secret, url) = app.sessions().begin_sign_in().await?;
     let response = see_other(&url)?;
     let is_https = app.access.openid().is_some_and(Provider::is_https);
     with_sign_in_cookie(response, is_https, secret.reveal(), SIGN_IN_TIME_S)
@@ -109,7 +109,7 @@ async fn finish(app: &App, uri: &Uri, headers: &HeaderMap) -> Result<Response> {
     let read = if is_https { host_cookie } else { cookie };
     let secret = SignInSecret::of_cookie(read(headers, SIGN_IN_COOKIE).ok_or_else(missing)?);
     let (state, code) = parameter("state").zip(parameter("code")).ok_or_else(missing)?;
-    let token = app.finish_sign_in(&secret, &state, &code).await?;
+    let token = app.sessions().finish_sign_in(&secret, &state, &code).await?;
     end_former(app, headers);
     // The address has the code, which no page is to learn.
     let response = with_cookie(see_other("/")?, is_https, token.reveal(), SESSION_TIME.as_secs())?;

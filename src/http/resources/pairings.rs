@@ -44,8 +44,8 @@ struct PairingParts {
     /// of the same; recognised by the part's content type or its file's name.
     #[schema(value_type = String, format = Binary)]
     detections: Vec<u8>,
-    /// CSV (`time`, `longitude`, `latitude`, optional `receiver_id` and `sigma_m`), NMEA 0183, GPX or
-    /// gpsd's reports, one a line; recognised by the part's content type or its file's name.
+    /// CSV (`time`, `longitude`, `latitude`, optional `receiver_id` and `sigma_m`), NMEA 0183, GPX, FIT, a solution of
+    /// RTKLIB, a log of GnssLogger or gpsd's reports, one a line; recognised by the part's content type or its file's name.
     #[schema(value_type = String, format = Binary)]
     fixes: Vec<u8>,
 }
@@ -276,7 +276,7 @@ async fn pair_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, req
         names[1],
         FixFormat::from_media_type,
         FixFormat::from_path,
-        "CSV, NMEA, GPX, gpsd's reports or solutions of RTKLIB",
+        "CSV, NMEA, GPX, FIT, gpsd's reports, solutions of RTKLIB or a log of GnssLogger",
     )?;
     let import = PairedImport {
         detections: detections.content,

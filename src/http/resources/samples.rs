@@ -317,9 +317,7 @@ async fn export(app: App, id: CameraId, filter: SampleFilter, format: Format) ->
     responses((status = 200, description = "Their number", body = SampleCount))
 )]
 async fn count_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
-    let mut params = Params::of(&uri)?;
-    let filter = filter(&mut params)?;
-    params.end()?;
+    let filter = only_filter(&uri)?;
     let domain::SampleCount { all, without_fix } = app.count_samples(&id, &filter).await?;
     Ok(json(&SampleCount { count: all, without_fix })?)
 }
@@ -339,9 +337,7 @@ async fn count_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, ur
     responses((status = 200, description = "How many were deleted", body = DeletedSamples))
 )]
 async fn delete_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
-    let mut params = Params::of(&uri)?;
-    let filter = filter(&mut params)?;
-    params.end()?;
+    let filter = only_filter(&uri)?;
     if filter == SampleFilter::default() {
         return Err(Error::invalid(
             "from",
@@ -350,6 +346,14 @@ async fn delete_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, u
         .into());
     }
     Ok(json(&DeletedSamples { deleted: app.delete_samples(&id, &filter).await? })?)
+}
+
+/// The filter of a query that has no other parameters.
+fn only_filter(uri: &Uri) -> Result<SampleFilter> {
+    let mut params = Params::of(uri)?;
+    let filter = filter(&mut params)?;
+    params.end()?;
+    Ok(filter)
 }
 
 fn filter(params: &mut Params) -> Result<SampleFilter> {

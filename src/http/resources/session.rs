@@ -90,7 +90,7 @@ impl Session {
 )]
 async fn start_session(CallerApp(app): CallerApp, headers: HeaderMap, body: JsonBody) -> ApiResult {
     let SessionDraft { key } = body.read()?;
-    let (token, principal) = app.start_session(&key).await?;
+    let (token, principal) = app.sessions().start(&key).await?;
     end_former(&app, &headers);
     let response = json(&Session::of(&principal))?;
     Ok(with_cookie(response, is_https(&headers), token.reveal(), SESSION_TIME.as_secs())?)

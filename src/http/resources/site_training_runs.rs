@@ -1,21 +1,21 @@
 //! `/v1/sites/{site}/training-runs`: background fits of all cameras of a site together.
 
-use hyper::{StatusCode, Uri};
+use hyper::Uri;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::runs;
 use crate::app::SiteRunRequest;
-use crate::domain::{self, Result, RunProgress, SiteId, SiteTrainingReport};
-use crate::exchange::write_cursor;
+use crate::domain::{self, Error, Result, RunProgress, SiteId, SiteTrainingReport};
 use crate::http::plumbing::access::CallerApp;
-use crate::http::plumbing::extract::{JsonBody, Params, SitePath, SiteRunPath};
+use crate::http::plumbing::extract::{JsonBody, SitePath, SiteRunPath};
 use crate::http::plumbing::idempotency::Idempotent;
 use crate::http::plumbing::problem::{ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
-use crate::http::plumbing::wire::{JobState, created, instant, json};
+use crate::http::plumbing::wire::{JobState, instant, json};
 
 pub(super) fn routes() -> OpenApiRouter<Rest> {
     OpenApiRouter::new()
@@ -38,12 +38,14 @@ struct SiteRunDraft {
     until: Option<String>,
 }
 
-impl SiteRunDraft {
-    fn to_domain(&self) -> Result<SiteRunRequest> {
-        Ok(SiteRunRequest {
-            seed: self.seed,
-            from: instant("from", self.from.as_deref())?,
-            until: instant("until", self.until.as_deref())?,
+impl TryFrom<SiteRunDraft> for SiteRunRequest {
+    type Error = Error;
+
+    fn try_from(draft: SiteRunDraft) -> Result<Self> {
+        Ok(Self {
+            seed: draft.seed,
+            from: instant("from", draft.from.as_deref())?,
+            until: instant("until", draft.until.as_deref())?,
         })
     }
 }
@@ -144,16 +146,11 @@ struct SiteRunPage {
 async fn start_site_training_run(
     CallerApp(app): CallerApp,
     SitePath(id): SitePath,
+    uri: Uri,
     Idempotent(idempotent): Idempotent,
     body: JsonBody,
 ) -> ApiResult {
-    if let Some(request) = &idempotent {
-        request.hasher.update(body.bytes());
-    }
-    let draft = body.read_or_default::<SiteRunDraft>()?;
-    let run = app.start_run(&id, draft.to_domain()?, idempotent).await?;
-    let location = format!("/v1/sites/{id}/training-runs/{}", run.id);
-    Ok(created(StatusCode::ACCEPTED, &location, &SiteTrainingRun::from(run))?)
+    runs::start::<SiteTrainingRun, SiteRunDraft, _>(&app, &id, &uri, idempotent, &body).await
 }
 
 /// List training runs of a site, newest first
@@ -167,15 +164,8 @@ async fn start_site_training_run(
     responses((status = 200, description = "A page of runs", body = SiteRunPage))
 )]
 async fn list_site_training_runs(CallerApp(app): CallerApp, SitePath(id): SitePath, uri: Uri) -> ApiResult {
-    let mut params = Params::of(&uri)?;
-    let limit = params.limit(app.limits.page_items)?;
-    let before = params.cursor()?;
-    params.end()?;
-    let page = app.runs(&id, before, limit).await?;
-    Ok(json(&SiteRunPage {
-        items: page.items.into_iter().map(SiteTrainingRun::from).collect(),
-        next_cursor: page.next.map(|run| write_cursor(&run)),
-    })?)
+    let (items, next_cursor) = runs::page(&app, &id, &uri).await?;
+    Ok(json(&SiteRunPage { items, next_cursor })?)
 }
 
 /// Read a training run of a site
@@ -185,7 +175,7 @@ async fn list_site_training_runs(CallerApp(app): CallerApp, SitePath(id): SitePa
     responses((status = 200, description = "The run", body = SiteTrainingRun))
 )]
 async fn get_site_training_run(CallerApp(app): CallerApp, SiteRunPath(id, run): SiteRunPath) -> ApiResult {
-    Ok(json(&SiteTrainingRun::from(app.run(&id, run).await?))?)
+    Ok(json(&SiteTrainingRun::from(app.training().get(&id, run).await?))?)
 }
 
 /// Cancel a training run of a site
@@ -200,5 +190,5 @@ async fn get_site_training_run(CallerApp(app): CallerApp, SiteRunPath(id, run): 
     )
 )]
 async fn cancel_site_training_run(CallerApp(app): CallerApp, SiteRunPath(id, run): SiteRunPath) -> ApiResult {
-    Ok(json(&SiteTrainingRun::from(app.cancel_run(&id, run).await?))?)
+    Ok(json(&SiteTrainingRun::from(app.training().cancel(&id, run).await?))?)
 }

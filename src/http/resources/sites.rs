@@ -141,7 +141,7 @@ struct SitePage {
     )
 )]
 async fn create_site(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
-    let site = app.create_site(body.read::<SiteDraft>()?.into_domain()?).await?;
+    let site = app.sites().create(body.read::<SiteDraft>()?.into_domain()?).await?;
     let (location, version) = (format!("/v1/sites/{}", site.id()), site.version());
     Ok(with_etag(created(StatusCode::CREATED, &location, &Site::from(site))?, version).await?)
 }
@@ -160,7 +160,7 @@ async fn list_sites(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let limit = params.limit(app.limits.page_items)?;
     let after = params.cursor()?;
     params.end()?;
-    let page = app.sites(after.as_ref(), limit).await?;
+    let page = app.sites().list(after.as_ref(), limit).await?;
     Ok(json(&SitePage {
         items: page.items.into_iter().map(Site::from).collect(),
         next_cursor: page.next.map(|id| write_cursor(&id)),
@@ -180,7 +180,7 @@ async fn list_sites(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     )
 )]
 async fn get_site(CallerApp(app): CallerApp, SitePath(id): SitePath, headers: HeaderMap) -> ApiResult {
-    let site = app.site(&id).await?;
+    let site = app.sites().get(&id).await?;
     let version = site.version();
     Ok(unless_known(&headers, with_etag(json(&Site::from(site))?, version).await?))
 }
@@ -212,9 +212,9 @@ async fn change_site(
     let expected = etag::required(&headers)?;
     let patch = body.read::<JsonObject>()?;
     let change = || async {
-        let site = app.site(&id).await?;
+        let site = app.sites().get(&id).await?;
         let version = expected.unwrap_or(site.version());
-        app.change_site(&id, patched(site, &patch)?, Some(version)).await
+        app.sites().change(&id, patched(site, &patch)?, Some(version)).await
     };
     let changed = merge_patch::retried(expected.is_some(), change).await?;
     let version = changed.version();
@@ -237,6 +237,6 @@ async fn change_site(
     )
 )]
 async fn delete_site(CallerApp(app): CallerApp, SitePath(id): SitePath, headers: HeaderMap) -> ApiResult {
-    app.delete_site(&id, etag::optional(&headers)?).await?;
+    app.sites().delete(&id, etag::optional(&headers)?).await?;
     Ok(empty())
 }

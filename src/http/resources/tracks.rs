@@ -158,7 +158,7 @@ impl From<&TrackPoint> for TrackState {
             covariance: state.normal_covariance().into(),
             nis: state.nis,
             rejections: state.rejected.iter().map(Into::into).collect(),
-            restarted: state.reinitialized,
+            restarted: state.restarted,
             sources_disagree: state.sources_disagree,
         }
     }

@@ -7,7 +7,7 @@ use axum::extract::State;
 use axum::response::IntoResponse as _;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::StreamExt as _;
-use hyper::{StatusCode, Uri};
+use hyper::Uri;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
@@ -15,15 +15,15 @@ use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::runs;
 use crate::app::RunRequest;
-use crate::domain::{self, CameraId, EpochReport, Error, Result, RunProgress, TrainingReport};
-use crate::exchange::write_cursor;
+use crate::domain::{self, CameraId, EpochReport, Error, Recipe, Result, RunProgress, TrainingReport};
 use crate::http::plumbing::access::CallerApp;
-use crate::http::plumbing::extract::{CameraPath, Client, JsonBody, LastEventId, Params, RunPath};
+use crate::http::plumbing::extract::{CameraPath, Client, JsonBody, LastEventId, RunPath};
 use crate::http::plumbing::idempotency::Idempotent;
 use crate::http::plumbing::problem::{ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
-use crate::http::plumbing::wire::{JobState, Recipe, created, empty, instant, json};
+use crate::http::plumbing::wire::{JobState, empty, instant, json};
 
 /// How often a silent event stream says that it is still there.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -59,14 +59,16 @@ struct RunDraft {
     until: Option<String>,
 }
 
-impl RunDraft {
-    fn to_domain(&self) -> Result<RunRequest> {
-        Ok(RunRequest {
-            recipe: self.recipe.map(domain::Recipe::from),
-            seed: self.seed,
-            epochs: self.epochs,
-            from: instant("from", self.from.as_deref())?,
-            until: instant("until", self.until.as_deref())?,
+impl TryFrom<RunDraft> for RunRequest {
+    type Error = Error;
+
+    fn try_from(draft: RunDraft) -> Result<Self> {
+        Ok(Self {
+            recipe: draft.recipe,
+            seed: draft.seed,
+            epochs: draft.epochs,
+            from: instant("from", draft.from.as_deref())?,
+            until: instant("until", draft.until.as_deref())?,
         })
     }
 }
@@ -130,7 +132,7 @@ impl From<domain::TrainingRun<CameraId>> for TrainingRun {
         Self {
             id: run.id.to_string(),
             camera_id: run.subject.as_str().to_owned(),
-            recipe: run.options.recipe.into(),
+            recipe: run.options.recipe,
             seed: run.options.seed,
             epochs: run.options.epochs,
             from: run.options.from,
@@ -177,15 +179,11 @@ struct RunPage {
 async fn start_training_run(
     CallerApp(app): CallerApp,
     CameraPath(id): CameraPath,
+    uri: Uri,
     Idempotent(idempotent): Idempotent,
     body: JsonBody,
 ) -> ApiResult {
-    if let Some(request) = &idempotent {
-        request.hasher.update(body.bytes());
-    }
-    let run = app.start_run(&id, body.read_or_default::<RunDraft>()?.to_domain()?, idempotent).await?;
-    let location = format!("/v1/cameras/{id}/training-runs/{}", run.id);
-    Ok(created(StatusCode::ACCEPTED, &location, &TrainingRun::from(run))?)
+    runs::start::<TrainingRun, RunDraft, _>(&app, &id, &uri, idempotent, &body).await
 }
 
 /// List training runs, newest first
@@ -199,15 +197,8 @@ async fn start_training_run(
     responses((status = 200, description = "A page of runs", body = RunPage))
 )]
 async fn list_training_runs(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
-    let mut params = Params::of(&uri)?;
-    let limit = params.limit(app.limits.page_items)?;
-    let before = params.cursor()?;
-    params.end()?;
-    let page = app.runs(&id, before, limit).await?;
-    Ok(json(&RunPage {
-        items: page.items.into_iter().map(TrainingRun::from).collect(),
-        next_cursor: page.next.map(|run| write_cursor(&run)),
-    })?)
+    let (items, next_cursor) = runs::page(&app, &id, &uri).await?;
+    Ok(json(&RunPage { items, next_cursor })?)
 }
 
 /// Read a training run
@@ -217,7 +208,7 @@ async fn list_training_runs(CallerApp(app): CallerApp, CameraPath(id): CameraPat
     responses((status = 200, description = "The run", body = TrainingRun))
 )]
 async fn get_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
-    Ok(json(&TrainingRun::from(app.run(&id, run).await?))?)
+    Ok(json(&TrainingRun::from(app.training().get(&id, run).await?))?)
 }
 
 /// Delete a training run
@@ -233,7 +224,7 @@ async fn get_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) 
     )
 )]
 async fn delete_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
-    app.delete_run(&id, run).await?;
+    app.training().delete(&id, run).await?;
     Ok(empty())
 }
 
@@ -249,7 +240,7 @@ async fn delete_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPat
     )
 )]
 async fn cancel_training_run(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
-    Ok(json(&TrainingRun::from(app.cancel_run(&id, run).await?))?)
+    Ok(json(&TrainingRun::from(app.training().cancel(&id, run).await?))?)
 }
 
 /// Watch a training run
@@ -282,7 +273,7 @@ async fn watch_training_run(
         return Ok(empty());
     }
     let lease = app.quotas.event_streams.try_acquire(client, 1)?;
-    let changes = app.watch_run(&id, run).await?;
+    let changes = app.training().watch(&id, run).await?;
     let shutdown = rest.shutdown.clone();
     let events = changes.take_until(async move { shutdown.draining().await }).filter_map(move |change| {
         let _held = &lease; // until the stream is dropped
@@ -335,7 +326,7 @@ struct TrainingLog {
     responses((status = 200, description = "The log", body = TrainingLog))
 )]
 async fn get_training_log(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
-    let lines = app.run_log(&id, run).await?;
+    let lines = app.training().log(&id, run).await?;
     Ok(json(&TrainingLog { items: lines.into_iter().map(|(time, text)| LogLine { time, text }).collect() })?)
 }
 
@@ -353,5 +344,5 @@ struct TrainingCurve {
     responses((status = 200, description = "The curve", body = TrainingCurve))
 )]
 async fn get_training_curve(CallerApp(app): CallerApp, RunPath(id, run): RunPath) -> ApiResult {
-    Ok(json(&TrainingCurve { items: app.run_epochs(&id, run).await? })?)
+    Ok(json(&TrainingCurve { items: app.training().epochs(&id, run).await? })?)
 }

@@ -309,3 +309,33 @@ async fn a_camera_that_changes_nodes_loses_no_position_and_doubles_none() {
         "61 observations, 6 of them sent to both nodes"
     );
 }
+
+/// What a node has seen of a camera is older than what the next owner has seen, and no track of now.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_former_owner_lists_no_tracks_of_its_own_once_the_next_one_has_ended() {
+    let folder = data_folder();
+    let (first, second) = (node(folder.path()), node(folder.path()));
+    first.post("/v1/sites", &json!({"id": "port"})).await.expect(201);
+    create(&first, &json!({"id": "yard", "site": "port"})).await;
+    let fix = |target: &str| {
+        json!({"time": now().to_string(), "target_id": target,
+            "fix": {"longitude_deg": 103.98678, "latitude_deg": 30.628, "sigma_m": 1.5}})
+    };
+    fix_when_owner(&first, "yard", &fix("van")).await;
+    let lists = [("/v1/cameras/yard/tracks", "features"), ("/v1/sites/port/tracks", "items")];
+    for (path, list) in lists {
+        let tracks = first.get(path).await.expect(200).json();
+        assert_eq!(tracks[list].as_array().map(Vec::len), Some(1), "{path}: {tracks}");
+    }
+    hand_over(folder.path(), "yard", &second);
+    fix_when_owner(&second, "yard", &fix("bus")).await;
+    let targets =
+        async || first.get("/v1/camera-statuses").await.expect(200).json()["items"][0]["targets"].clone();
+    assert_eq!(targets().await, 0);
+    assert!(second.terminate(), "the server ends in order");
+    for (path, list) in lists {
+        let tracks = super::until_status(&first, path, 200).await.json();
+        assert_eq!(tracks[list], json!([]), "{path}: {tracks}");
+    }
+}

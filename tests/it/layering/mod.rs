@@ -47,6 +47,8 @@ const LIBRARIES: &[(&str, &[&str])] = &[
     ("ring", &["openid"]),
     ("rumqttc", &["connect"]),
     ("rsasl", &["connect"]),
+    ("rtsp_types", &["connect"]),
+    ("http_auth", &["connect"]),
     ("crc32c", &["connect"]),
     ("lz4_flex", &["connect"]),
     ("snap", &["connect"]),

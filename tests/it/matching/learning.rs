@@ -1,5 +1,7 @@
-//! From a detector's tracker and a phone, each with ids of its own, to a model and live positions, over a real mosquitto.
+//! From a detector's tracker and a phone, each with ids of its own, to a model and live positions, over a real mosquitto, and
+//! from a camera's metadata over GStreamer's RTSP server.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
@@ -10,7 +12,7 @@ use super::ONE_AMONG_TEN;
 use super::crowd::{Crowd, Recorded};
 use super::live::{Row, rows};
 use crate::harness::{TestServer, data_folder, now};
-use crate::outside::peers::{Broker, connection_when};
+use crate::outside::peers::{Broker, RtspCamera, connection_when};
 
 /// Recorded time after which the camera must have its model, s.
 const LEARNT_FROM_S: f64 = 600.0;
@@ -18,6 +20,8 @@ const LEARNT_FROM_S: f64 = 600.0;
 const RECEIVED: u32 = 100;
 /// Time of messages that are published at once, s.
 const SLICE_S: f64 = 20.0;
+/// Image size of the square's camera, px.
+const SIZE_PX: [f64; 2] = [1920.0, 1080.0];
 
 /// An event of Frigate with the state after a change.
 fn frigate_event(camera: &str, row: &Row, shift: SignedDuration) -> String {
@@ -28,6 +32,26 @@ fn frigate_event(camera: &str, row: &Row, shift: SignedDuration) -> String {
         "box": [left, top, left + width, top + height],
     }})
     .to_string()
+}
+
+/// A frame of ONVIF metadata with the boxes of one time, in the coordinates and with the elements that Hanwha's cameras have.
+fn onvif_frame(boxes: &[&Row], shift: SignedDuration) -> String {
+    let [x, y] = SIZE_PX.map(|side_px| 2.0 / side_px);
+    let objects = boxes.iter().map(|row| {
+        let [left, top, width, height] = row.numbers[..] else { panic!("a box") };
+        format!(
+            r#"<tt:Object ObjectId="{}" Parent="0"><tt:Appearance><tt:Shape><tt:BoundingBox left="{left}" top="{top}" right="{}" bottom="{}"/></tt:Shape><tt:Class><tt:Type Likelihood="0.88">Human</tt:Type></tt:Class></tt:Appearance></tt:Object>"#,
+            row.id,
+            left + width,
+            top + height,
+        )
+    });
+    format!(
+        r#"<tt:MetadataStream xmlns:tt="http://www.onvif.org/ver10/schema"><tt:VideoAnalytics><tt:Frame UtcTime="{}"><tt:Transformation><tt:Translate x="-1.0" y="1.0"/><tt:Scale x="{x}" y="{}"/></tt:Transformation>{}</tt:Frame></tt:VideoAnalytics></tt:MetadataStream>"#,
+        boxes[0].time + shift,
+        -y,
+        objects.collect::<String>(),
+    )
 }
 
 /// A position as Traccar forwards it.
@@ -41,10 +65,48 @@ fn traccar_position(row: &Row, shift: SignedDuration) -> String {
     .to_string()
 }
 
+/// Where a square's boxes come from.
+enum Detector {
+    /// Frigate, by the broker.
+    Frigate,
+    /// A camera, by its own stream.
+    Onvif(RefCell<RtspCamera>),
+}
+
+impl Detector {
+    fn source(&self, broker: &Broker, camera: &str) -> Value {
+        match self {
+            Self::Frigate => json!({
+                "address": broker.address(), "format": "frigate", "topics": [format!("{camera}/events")],
+                "cameras": {"front_door": {"camera_id": camera}}, "store_samples": true,
+            }),
+            Self::Onvif(stream) => json!({
+                "address": stream.borrow().address(), "format": "onvif",
+                "cameras": {"*": {"camera_id": camera}}, "store_samples": true,
+            }),
+        }
+    }
+
+    fn publish(&self, boxes: &[&Row], square: &Square<'_>) {
+        match self {
+            Self::Frigate => {
+                let events = boxes.iter().map(|row| frigate_event("front_door", row, square.shift));
+                square.broker.publish_lines(&format!("{}/events", square.camera), events);
+            }
+            Self::Onvif(stream) => {
+                let mut stream = stream.borrow_mut();
+                let frames = boxes.chunk_by(|one, next| one.time == next.time);
+                frames.for_each(|boxes| stream.send(&onvif_frame(boxes, square.shift)));
+            }
+        }
+    }
+}
+
 /// A square of a broker: its camera, the detector's and the phone's connection.
 struct Square<'a> {
     server: &'a TestServer,
     broker: &'a Broker,
+    detector: Detector,
     camera: String,
     recorded: Recorded,
     rows: Vec<Row>,
@@ -53,20 +115,18 @@ struct Square<'a> {
 }
 
 impl<'a> Square<'a> {
-    async fn new(server: &'a TestServer, broker: &'a Broker, crowd: Crowd) -> Self {
+    async fn new(server: &'a TestServer, broker: &'a Broker, detector: Detector, crowd: Crowd) -> Self {
         let camera = format!("square-{}", crowd.seed);
-        let draft = json!({"id": camera, "image_size": {"width_px": 1920, "height_px": 1080}});
+        let [width_px, height_px] = SIZE_PX;
+        let draft =
+            json!({"id": camera, "image_size": {"width_px": width_px as u32, "height_px": height_px as u32}});
         server.post("/v1/cameras", &draft).await.expect(201);
-        let address = format!("mqtt://127.0.0.1:{}", broker.port);
-        let detector = json!({"id": format!("frigate-{camera}"), "source": {
-            "address": address, "format": "frigate", "topics": [format!("{camera}/events")],
-            "cameras": {"front_door": {"camera_id": camera}}, "store_samples": true,
-        }});
+        let boxes = json!({"id": format!("boxes-{camera}"), "source": detector.source(broker, &camera)});
         let phone = json!({"id": format!("phones-{camera}"), "source": {
-            "address": address, "format": "traccar", "topics": [format!("{camera}/positions")],
+            "address": broker.address(), "format": "traccar", "topics": [format!("{camera}/positions")],
             "camera_ids": [camera], "store_samples": true,
         }});
-        for draft in [&detector, &phone] {
+        for draft in [&boxes, &phone] {
             server.post("/v1/connections", draft).await.expect(201);
             let id = draft["id"].as_str().expect("text");
             connection_when(server, id, |status| status["state"] == "running").await;
@@ -74,7 +134,7 @@ impl<'a> Square<'a> {
         let recorded = crowd.recorded();
         let rows = rows(&recorded);
         let shift = now().duration_since(rows.last().expect("rows").time);
-        Self { server, broker, camera, recorded, rows, shift }
+        Self { server, broker, detector, camera, recorded, rows, shift }
     }
 
     fn since_start_s(&self, row: &Row) -> f64 {
@@ -86,8 +146,7 @@ impl<'a> Square<'a> {
         let is_within = |row: &&Row| (from_s..until_s).contains(&self.since_start_s(row));
         let (boxes, fixes): (Vec<&Row>, Vec<&Row>) =
             self.rows.iter().filter(is_within).partition(|row| row.walker.is_some());
-        let events = boxes.iter().map(|row| frigate_event("front_door", row, self.shift));
-        self.broker.publish_lines(&format!("{}/events", self.camera), events);
+        self.detector.publish(&boxes, self);
         let positions = fixes.iter().map(|row| traccar_position(row, self.shift));
         self.broker.publish_lines(&format!("{}/positions", self.camera), positions);
     }
@@ -153,14 +212,24 @@ impl<'a> Square<'a> {
     }
 }
 
-/// The story of a detector and a phone that know nothing of each other: eleven people, of whom one carries the phone.
 #[tokio::test]
 #[ignore = "needs mosquitto"]
 async fn a_camera_of_a_broker_learns_by_itself_whose_phone_it_sees() {
+    learns_by_itself_whose_phone_it_sees(Detector::Frigate).await;
+}
+
+#[tokio::test]
+#[ignore = "needs mosquitto and GStreamer's RTSP server"]
+async fn a_camera_of_rtsp_learns_by_itself_whose_phone_it_sees() {
+    learns_by_itself_whose_phone_it_sees(Detector::Onvif(RefCell::new(RtspCamera::start()))).await;
+}
+
+/// The story of a detector and a phone that know nothing of each other: eleven people, of whom one carries the phone.
+async fn learns_by_itself_whose_phone_it_sees(detector: Detector) {
     let broker = Broker::start();
     let folder = data_folder();
     let server = TestServer::start(folder.path());
-    let square = Square::new(&server, &broker, Crowd { seconds: 720, ..ONE_AMONG_TEN }).await;
+    let square = Square::new(&server, &broker, detector, Crowd { seconds: 720, ..ONE_AMONG_TEN }).await;
     assert_eq!(square.recorded.walkers.iter().max(), Some(&10));
     let learning = square.learning().await;
     assert_eq!(learning["state"], "recording", "{learning}");
@@ -184,7 +253,7 @@ async fn a_camera_of_a_broker_learns_by_itself_whose_phone_it_sees() {
     let topic = format!("sightfix/{}/phone-0", square.camera);
     broker.subscribe(&topic);
     let sink = json!({"id": "positions", "sink": {
-        "address": format!("mqtt://127.0.0.1:{}", broker.port), "camera_ids": [square.camera], "min_interval_s": 0,
+        "address": broker.address(), "camera_ids": [square.camera], "min_interval_s": 0,
     }});
     server.post("/v1/connections", &sink).await.expect(201);
     connection_when(&server, "positions", |status| status["state"] == "running").await;
@@ -212,7 +281,7 @@ async fn marks_of_cameras_that_learn_by_themselves() {
     let server = TestServer::start(folder.path());
     let (mut learnt, mut wrong) = (0, 0);
     for seed in 1..=10 {
-        let square = Square::new(&server, &broker, Crowd { seed, ..ONE_AMONG_TEN }).await;
+        let square = Square::new(&server, &broker, Detector::Frigate, Crowd { seed, ..ONE_AMONG_TEN }).await;
         square.publish_slices(0.0, LEARNT_FROM_S, SLICE_S, Duration::ZERO).await;
         let learning = square.learnt().await;
         let (right, all) = square.samples().await;

@@ -1,7 +1,7 @@
 //! The other ends of connections.
 
-use std::io::Write as _;
-use std::process::{Child, Command, Stdio};
+use std::io::{BufRead as _, BufReader, Write as _};
+use std::process::{Child, ChildStdin, Command, Stdio};
 use std::time::Duration;
 
 use hyper::body::Bytes;
@@ -63,6 +63,11 @@ impl Broker {
         Self { process, port, client_arguments, _folder: folder }
     }
 
+    /// Where the server reaches it.
+    pub(crate) fn address(&self) -> String {
+        format!("mqtt://127.0.0.1:{}", self.port)
+    }
+
     /// Publishes with QoS 1 by mosquitto's own client.
     pub(crate) fn publish(&self, topic: &str, message: &str) {
         let mut command = Command::new("mosquitto_pub");
@@ -120,6 +125,51 @@ impl Broker {
 }
 
 impl Drop for Broker {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+/// A camera's metadata on GStreamer's RTSP server; killed when dropped.
+pub(crate) struct RtspCamera {
+    process: Child,
+    documents: ChildStdin,
+    pub(crate) port: u16,
+}
+
+impl RtspCamera {
+    pub(crate) fn start() -> Self {
+        Self::start_at(own_address().port(), &[])
+    }
+
+    /// One that asks for digest authentication if a name and a password are given.
+    pub(super) fn start_at(port: u16, user: &[&str]) -> Self {
+        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/it/outside/rtsp_server.py");
+        // Debian's Python has its bindings.
+        let mut command = Command::new("/usr/bin/python3");
+        command.args([script, &port.to_string()]).args(user).stderr(Stdio::null());
+        let mut process =
+            command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("python3-gi is installed");
+        let mut ready = String::new();
+        let printed = process.stdout.take().expect("piped");
+        BufReader::new(printed).read_line(&mut ready).expect("it writes");
+        assert_eq!(ready, "ready\n");
+        let documents = process.stdin.take().expect("piped");
+        Self { process, documents, port }
+    }
+
+    pub(crate) fn address(&self) -> String {
+        format!("rtsp://127.0.0.1:{}/onvif/metadata", self.port)
+    }
+
+    /// Sends an XML document without line breaks to those who play the stream.
+    pub(crate) fn send(&mut self, document: &str) {
+        writeln!(self.documents, "{document}").expect("it reads");
+    }
+}
+
+impl Drop for RtspCamera {
     fn drop(&mut self) {
         let _ = self.process.kill();
         let _ = self.process.wait();

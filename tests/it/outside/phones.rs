@@ -2,18 +2,19 @@
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use jiff::{Timestamp, ToSpan as _};
 use serde_json::{Value, json};
 
 use super::peers::create_gate;
 use crate::harness::{TestServer, data_folder, now};
 
-/// A server with the source `phones` for the camera `gate`, the key of its administrator and one of a device.
+/// A server with the source `phones` for the camera `gate`, as "Add phone" in the console makes it, the key of its administrator and one of a device.
 async fn start(settings: &[(&str, &str)]) -> (TestServer, tempfile::TempDir, String, String) {
     let folder = data_folder();
     let server = TestServer::start_with(folder.path(), settings);
     create_gate(&server).await;
-    let source =
-        json!({"id": "phones", "source": {"address": "push:", "format": "phone", "camera_ids": ["gate"]}});
+    let source = json!({"id": "phones", "source": {"address": "push:", "format": "phone", "camera_ids": ["gate"],
+        "receiver_from": "sender", "store_samples": true}});
     server.post("/v1/connections", &source).await.expect(201);
     let admin = json!({"name": "admin", "role": "admin"});
     let admin = secret(&server.post("/v1/keys", &admin).await.expect(201).json());
@@ -70,6 +71,114 @@ async fn phones_present_their_key_as_they_can_and_read_the_answer_that_they_expe
     let form = [("authorization", basic.as_str()), ("content-type", "application/x-www-form-urlencoded")];
     server.send("POST", MESSAGES, &form, query.replace("car", "van")).await.expect(204);
     assert_eq!(targets(&server, &admin).await, ["bus", "car", "iphone", "jane/phone", "van"]);
+}
+
+/// A request of an application with the settings of "Add phone" in the console, and the receiver that it names.
+struct PhoneRequest {
+    target: &'static str,
+    path: String,
+    authorization: Option<String>,
+    body: String,
+    states_time: bool,
+}
+
+/// One position of each application, at a time.
+fn phone_requests(key: &str, time: Timestamp) -> Vec<PhoneRequest> {
+    const LATITUDE: f64 = 30.628;
+    const LONGITUDE: f64 = 103.98678;
+    let (url, with_key) = (MESSAGES.to_owned(), format!("{MESSAGES}/{key}"));
+    let basic = || Some(format!("Basic {}", STANDARD.encode(format!("jane:{key}"))));
+    let request = |target, path: &str, authorization, body: Value| PhoneRequest {
+        target,
+        path: path.to_owned(),
+        authorization,
+        body: if body.is_null() { String::new() } else { body.to_string() },
+        states_time: body["type"] != "update_location",
+    };
+    let (second, millisecond) = (time.as_second(), time.as_millisecond());
+    let query = format!("lat={LATITUDE}&lon={LONGITUDE}&timestamp={second}&accuracy=6.0");
+    vec![
+        request(
+            "anna/phone",
+            &url,
+            basic(),
+            json!({"_type": "location", "topic": "owntracks/anna/phone", "tid": "an",
+            "tst": second, "lat": LATITUDE, "lon": LONGITUDE, "acc": 6, "vac": 3, "batt": 81, "conn": "m", "t": "u"}),
+        ),
+        request(
+            "82879256",
+            &with_key,
+            None,
+            json!({"location": {"timestamp": time.to_string(), "is_moving": true,
+            "coords": {"latitude": LATITUDE, "longitude": LONGITUDE, "accuracy": 6.1}}, "device_id": "82879256"}),
+        ),
+        request(
+            "old-traccar",
+            &format!("{with_key}?id=old-traccar&{query}&speed=0.2&bearing=26.2"),
+            None,
+            Value::Null,
+        ),
+        request("gpslogger", &format!("{url}?{query}&id=gpslogger"), basic(), Value::Null),
+        request(
+            "iphone",
+            &url,
+            Some(format!("Bearer {key}")),
+            json!({"locations": [{"type": "Feature",
+            "geometry": {"type": "Point", "coordinates": [LONGITUDE, LATITUDE]},
+            "properties": {"timestamp": time.to_string(), "horizontal_accuracy": 5, "device_id": "iphone"}}]}),
+        ),
+        request(
+            "pixel",
+            &with_key,
+            None,
+            json!({"messageId": 0, "sessionId": "s", "deviceId": "pixel", "payload": [
+            {"name": "location", "time": millisecond * 1_000_000,
+             "values": {"latitude": LATITUDE, "longitude": LONGITUDE, "horizontalAccuracy": 4}}]}),
+        ),
+        // It names neither a receiver nor a time.
+        request(
+            "jane",
+            &with_key,
+            None,
+            json!({"type": "update_location",
+            "data": {"gps": [LATITUDE, LONGITUDE], "gps_accuracy": 6}}),
+        ),
+    ]
+}
+
+#[tokio::test]
+async fn fixes_of_every_application_become_samples_with_the_boxes_that_come_after_them() {
+    let (server, _folder, admin, edge) = start(&[]).await;
+    let time = Timestamp::from_second(now().as_second()).expect("in range");
+    let requests = phone_requests(&edge, time);
+    for request in &requests {
+        let PhoneRequest { path, authorization, body, .. } = request;
+        let headers: Vec<_> = authorization.iter().map(|value| ("authorization", value.as_str())).collect();
+        let answer = server.send("POST", path, &headers, body.clone()).await;
+        assert!(answer.status.is_success(), "{path}: {} {}", answer.status, answer.text());
+    }
+    // A fix whose answer waited for its box would be too old for one that comes now.
+    let seen = |target: &str, time: Timestamp| {
+        json!({"time": time.to_string(), "target_id": target,
+            "bounding_box": {"left_px": 600.0, "top_px": 300.0, "width_px": 40.0, "height_px": 90.0}})
+    };
+    let (untimed, timed): (Vec<_>, Vec<_>) = requests.iter().partition(|request| !request.states_time);
+    let mut observations: Vec<Value> = timed.iter().map(|request| seen(request.target, time)).collect();
+    // The instant at which the other came is known to the server alone.
+    let instants = time.series(400.milliseconds()).take_while(|instant| *instant <= now());
+    observations.extend(instants.map(|instant| seen(untimed[0].target, instant)));
+    let boxes = json!({"observations": observations});
+    let headers = [("content-type", "application/json"), ("authorization", admin.as_str())];
+    let path = "/v1/cameras/gate/tracks?store_samples=true";
+    server.send("POST", path, &headers, boxes.to_string()).await.expect(200);
+
+    let samples = server.send("GET", "/v1/cameras/gate/samples", &headers[1..], "").await.expect(200).json();
+    let samples = samples["items"].as_array().expect("items").iter();
+    let mut stored: Vec<&str> = samples.map(|it| it["target_id"].as_str().expect("an id")).collect();
+    stored.sort_unstable();
+    let mut expected: Vec<&str> = requests.iter().map(|request| request.target).collect();
+    expected.sort_unstable();
+    assert_eq!(stored, expected);
 }
 
 #[tokio::test]

@@ -97,6 +97,8 @@ async fn settings_that_cannot_work_are_refused_with_their_field() {
             source(json!({"address": "gpsd://receiver", "format": "nmea", "camera_ids": ["gate"]})),
             "source.format",
         ),
+        (source(json!({"address": "rtsp://camera/metadata", "format": "frigate"})), "source.format"),
+        (source(json!({"address": "rtsp://user@camera/metadata", "format": "onvif"})), "source.address"),
         (
             source(
                 json!({"address": "push:", "format": "frigate", "cameras": {"x": {"camera_id": "Not a slug"}}}),

@@ -303,7 +303,7 @@ pub struct CameraMoved {
     /// The model version concerned.
     pub model_version: u32,
     /// Estimated onset of the change.
-    pub began_at: Timestamp,
+    pub onset_at: Timestamp,
     /// When the alarm was raised.
     pub raised_at: Timestamp,
     /// Mean shift of the regressed positions relative to the fixes since the onset, towards east, m.

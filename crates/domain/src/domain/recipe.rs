@@ -1,13 +1,29 @@
 //! The recipes: ways to train a camera's model.
 
+use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, IntoStaticStr, VariantArray};
+use utoipa::ToSchema;
 
 use super::error::Error;
 
 /// A way to train a camera's model; `docs/explanation/method.md` describes each.
 #[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Display, EnumString, IntoStaticStr, VariantArray,
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Eq,
+    Hash,
+    Default,
+    Display,
+    EnumString,
+    IntoStaticStr,
+    VariantArray,
+    Serialize,
+    Deserialize,
+    ToSchema,
 )]
+#[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", parse_err_ty = Error, parse_err_fn = unknown_recipe)]
 pub enum Recipe {
     /// Liang et al. 2022 as published: raw pixels, standardised degrees, weights 1 : 2000, Es by (4).
@@ -35,5 +51,6 @@ impl Recipe {
 }
 
 fn unknown_recipe(_: &str) -> Error {
-    Error::invalid("recipe", "must be one of paper, hybrid, projective, gaussian_process, auto")
+    let names: Vec<&str> = Recipe::ALL.iter().map(|recipe| recipe.as_str()).collect();
+    Error::invalid("recipe", format!("must be one of {}", names.join(", ")))
 }

@@ -31,7 +31,7 @@ pub struct TrainingOptions {
 pub struct RunProgress {
     /// Current phase: `held-out group 2 of 4`, `final fit`.
     pub phase: String,
-    /// Completed epochs, over all phases.
+    /// Completed epochs, over all phases. The map of a recipe that has no network counts as some.
     pub epoch: u32,
     /// Total epochs, over all phases.
     pub epochs: u32,

@@ -1,5 +1,5 @@
 //! The experiments of the paper, and further ones of this project, as pages of results: docs/explanation/accuracy.md with
-//! its pictures, and docs/explanation/accuracy-tables.md behind it.
+//! its pictures, and docs/explanation/accuracy-tables.md with its figures.
 //!
 //! All models are fitted on training rows with the recipes unchanged; nothing is selected by test
 //! results.

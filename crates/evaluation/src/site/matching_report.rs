@@ -14,7 +14,7 @@ const KNOWN_MODEL_SEEDS: u64 = 1_000_000;
 /// Shift of the fixes, as a share of the recording, that leaves no identity true.
 const SHIFT: f64 = 0.4;
 
-/// What matching without a model found in some draws.
+/// The findings of matching without a model in some draws.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct JointFigures {
     /// Recordings of one camera.

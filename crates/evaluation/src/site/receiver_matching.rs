@@ -22,7 +22,7 @@ use crate::model::{FitError, FitInput, FitOptions, Regressor, fit};
 /// Every that many boxes are compared with the truth.
 const STRIDE: usize = 4;
 
-/// What matching without a model found in one camera.
+/// The findings of matching without a model in one camera.
 #[derive(Debug, Clone)]
 pub struct JointFound {
     /// The pairs.

@@ -7,10 +7,10 @@
 use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
-use super::xml::{attribute, numbers};
 use super::{MessageContext, MessageDecoder, MessageItem, Reading, ReportedFix};
 use crate::domain::parse_time;
 use crate::fix_quality::sigma_of_deviations;
+use crate::xml::{Element as _, numbers};
 
 pub(super) struct Cot;
 
@@ -32,12 +32,12 @@ struct Head {
 impl Head {
     fn of(element: &BytesStart<'_>) -> Result<Self, String> {
         let required =
-            |name: &str| attribute(element, name)?.ok_or_else(|| format!("an event has no attribute {name}"));
+            |name: &str| element.attribute(name)?.ok_or_else(|| format!("an event has no attribute {name}"));
         Ok(Self {
             uid: required("uid")?,
             kind: required("type")?,
             time: required("time")?,
-            how: attribute(element, "how")?.unwrap_or_default(),
+            how: element.attribute("how")?.unwrap_or_default(),
         })
     }
 
@@ -52,7 +52,7 @@ impl Head {
             return Err(format!("the position of {:.80} was entered by a person", self.uid));
         }
         let [latitude_deg, longitude_deg] = numbers(point, ["lat", "lon"])?;
-        let error_m = attribute(point, "ce")?.and_then(|text| text.trim().parse().ok());
+        let error_m = point.attribute("ce")?.and_then(|text| text.trim().parse().ok());
         let error_m = error_m.filter(|error_m: &f64| *error_m < UNKNOWN_M);
         let fix = ReportedFix {
             time: parse_time(&self.time).map_err(|error| error.to_string())?,

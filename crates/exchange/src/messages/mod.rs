@@ -17,7 +17,6 @@ mod onvif;
 mod phone;
 mod tagged;
 mod traccar;
-mod xml;
 
 use std::net::SocketAddr;
 
@@ -38,7 +37,7 @@ pub enum MessageFormat {
     Frigate,
     /// DeepStream's message schema, minimal or full.
     Deepstream,
-    /// A metadata stream of ONVIF's analytics (XML).
+    /// Metadata of ONVIF's analytics: XML, or the JSON of MQTT topics `onvif-mj`.
     Onvif,
     /// NMEA 0183 sentences: GGA of a receiver, and AIS (AIVDM).
     Nmea,

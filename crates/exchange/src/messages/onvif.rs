@@ -1,20 +1,22 @@
-//! The analytics frames of an ONVIF metadata stream (`tt:MetadataStream`, ONVIF Analytics Service Specification).
+//! The analytics frames of an ONVIF metadata stream (`tt:MetadataStream`, ONVIF Analytics Service Specification), in XML or
+//! in the JSON of MQTT topics `.../onvif-mj/VideoAnalytics/...`, whose names of attributes begin with `@`.
 //!
 //! A shape is in coordinates of its own, which the frame's `Transformation` maps to the normalised image: x to the
 //! right and y up, both from -1 to 1. Cameras differ in the sign of the scale of y, so the edges are ordered after the
 //! transformation. An appearance may have a transformation of its own, which is applied before that of its frame. Without
 //! any, edges beyond 1 are those of cameras that count the image from its upper left corner to 8191 (Dahua). An object that
-//! is part of another one (`Parent`), such as a face or a number plate (Hanwha), is no target. Frames without objects
-//! commonly have a scale of 0.
+//! is part of another one (`Parent`), such as a face or a number plate (Hanwha), is no target; a parent of `0` is none.
+//! Frames without objects commonly have a scale of 0.
 
 use quick_xml::Reader;
-use quick_xml::events::{BytesStart, Event};
+use quick_xml::events::Event;
+use serde_json::{Map, Value};
 
-use super::xml::{attribute, numbers};
 use super::{
-    DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, class, score,
+    DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, class, parse, score,
 };
 use crate::domain::{TargetId, parse_time};
+use crate::xml::{Element, numbers};
 
 pub(super) struct Onvif;
 
@@ -61,46 +63,113 @@ struct Frames {
 
 impl MessageDecoder for Onvif {
     fn decode(&mut self, payload: &[u8], context: &MessageContext<'_>) -> Result<Reading, String> {
+        let mut reading = Reading::default();
+        if payload.trim_ascii_start().starts_with(b"{") {
+            let stream = parse::<Map<String, Value>>(payload)?;
+            Frames::default().read_children(&stream, context, &mut reading)?;
+        } else {
+            Frames::default().read_xml(payload, context, &mut reading)?;
+        }
+        Ok(reading)
+    }
+}
+
+impl Element for Map<String, Value> {
+    fn attribute(&self, name: &str) -> Result<Option<String>, String> {
+        Ok(self.get(&format!("@{name}")).map(text_of))
+    }
+}
+
+/// A value as the text that it is in XML.
+fn text_of(value: &Value) -> String {
+    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
+}
+
+impl Frames {
+    fn read_xml(
+        &mut self,
+        payload: &[u8],
+        context: &MessageContext<'_>,
+        reading: &mut Reading,
+    ) -> Result<(), String> {
         let mut xml = Reader::from_reader(payload);
         let mut buffer = Vec::new();
-        let mut frames = Frames::default();
-        let mut reading = Reading::default();
         loop {
             buffer.clear();
             match xml.read_event_into(&mut buffer).map_err(|error| format!("is not XML: {error}"))? {
-                Event::Eof => return Ok(reading),
-                Event::Start(element) => frames.open(&element)?,
+                Event::Eof => return Ok(()),
+                Event::Start(element) => self.open(element.local_name().as_ref(), &element)?,
                 Event::Empty(element) => {
-                    frames.open(&element)?;
-                    frames.close(element.local_name().as_ref(), context, &mut reading);
+                    self.open(element.local_name().as_ref(), &element)?;
+                    self.close(element.local_name().as_ref(), context, reading);
                 }
-                Event::Text(text) if frames.reads_class => {
-                    if let Some(object) = &mut frames.object {
-                        object.class.get_or_insert_with(|| text.trim().to_owned());
-                    }
-                }
-                Event::End(element) => frames.close(element.local_name().as_ref(), context, &mut reading),
+                Event::Text(text) => self.read_text(&text),
+                Event::End(element) => self.close(element.local_name().as_ref(), context, reading),
                 _ => {}
             }
         }
     }
-}
 
-impl Frames {
-    fn open(&mut self, element: &BytesStart<'_>) -> Result<(), String> {
-        match element.local_name().as_ref() {
+    /// Reads the elements inside of one. A transformation holds for what is beside it, and the class of an object is not
+    /// that of what it carries, so both are read before the rest.
+    fn read_children(
+        &mut self,
+        parent: &Map<String, Value>,
+        context: &MessageContext<'_>,
+        reading: &mut Reading,
+    ) -> Result<(), String> {
+        let is_first = |name: &str| matches!(name, "Transformation" | "Class");
+        let (first, rest): (Vec<_>, Vec<_>) = parent.iter().partition(|(name, _)| is_first(name));
+        let is_element = |(name, _): &(&String, &Value)| !name.starts_with(['@', '#']);
+        for (name, value) in first.into_iter().chain(rest).filter(is_element) {
+            let elements = value.as_array().map_or_else(|| std::slice::from_ref(value), Vec::as_slice);
+            for element in elements {
+                self.read_json(name, element, context, reading)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads an element: an object, or the text of one without attributes.
+    fn read_json(
+        &mut self,
+        name: &str,
+        value: &Value,
+        context: &MessageContext<'_>,
+        reading: &mut Reading,
+    ) -> Result<(), String> {
+        let without_attributes = Map::new();
+        let element = value.as_object().unwrap_or(&without_attributes);
+        self.open(name, element)?;
+        self.read_children(element, context, reading)?;
+        let text = if value.is_object() { element.get("#text") } else { Some(value) };
+        text.into_iter().for_each(|text| self.read_text(&text_of(text)));
+        self.close(name, context, reading);
+        Ok(())
+    }
+
+    /// Takes a text, which is the object's class where that is open.
+    fn read_text(&mut self, text: &str) {
+        if let Some(object) = self.object.as_mut().filter(|_| self.reads_class) {
+            object.class.get_or_insert_with(|| text.trim().to_owned());
+        }
+    }
+
+    fn open(&mut self, name: &str, element: &impl Element) -> Result<(), String> {
+        match name {
             "Frame" => {
-                self.time = attribute(element, "UtcTime")?;
+                self.time = element.attribute("UtcTime")?;
                 self.transformation = None;
-                if let Some(source) = attribute(element, "Source")? {
+                if let Some(source) = element.attribute("Source")? {
                     self.source = source;
                 }
             }
             "Translate" => self.open_transformation().translation = numbers(element, ["x", "y"])?,
             "Scale" => self.open_transformation().scale = numbers(element, ["x", "y"])?,
             "Object" => {
-                let id = attribute(element, "ObjectId")?.unwrap_or_default();
-                let parent = attribute(element, "Parent")?.filter(|parent| !parent.is_empty());
+                let id = element.attribute("ObjectId")?.unwrap_or_default();
+                let parent =
+                    element.attribute("Parent")?.filter(|parent| !matches!(parent.as_str(), "" | "0"));
                 self.object = Some(Object { id, parent, ..Object::default() });
             }
             "BoundingBox" => {
@@ -111,7 +180,7 @@ impl Frames {
             }
             "Type" => {
                 self.reads_class = true;
-                let likelihood = attribute(element, "Likelihood")?.and_then(|text| text.parse().ok());
+                let likelihood = element.attribute("Likelihood")?.and_then(|text| text.parse().ok());
                 if let Some(object) = &mut self.object
                     && object.class.is_none()
                 {

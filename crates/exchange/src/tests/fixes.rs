@@ -196,6 +196,111 @@ fn solutions_of_rtklib_are_read_with_their_time_system() {
     assert!((sigma_m(1) - 0.035_36).abs() < 1e-5 && (sigma_m(2) - 5.303).abs() < 1e-3);
 }
 
+/// A FIT file of these messages, with its checksum.
+fn fit_file(messages: &[u8]) -> Vec<u8> {
+    let mut file = vec![12, 0x10, 0, 0];
+    file.extend(u32::try_from(messages.len()).expect("short").to_le_bytes());
+    file.extend(b".FIT");
+    file.extend(messages);
+    let checksum = file.iter().fold(0_u16, |sum, byte| {
+        (0..8).fold(sum ^ u16::from(*byte), |sum, _| if sum & 1 == 1 { sum >> 1 ^ 0xA001 } else { sum >> 1 })
+    });
+    file.extend(checksum.to_le_bytes());
+    file
+}
+
+/// Semicircles of degrees.
+fn semicircles(degrees: f64) -> i32 {
+    (degrees / 180.0 * 2_147_483_648.0).round() as i32
+}
+
+/// Records of both byte orders, with and without a developer's field, a time of five bits and an accuracy; the times of the
+/// examples of the protocol's description (FIT SDK, "Compressed Timestamp Header").
+fn fit_messages() -> Vec<u8> {
+    let position = [semicircles(30.628), semicircles(103.98678)];
+    let little = position.map(i32::to_le_bytes).concat();
+    let big = position.map(i32::to_be_bytes).concat();
+    // A file_id, whose fields are skipped.
+    let mut messages = vec![0x40, 0, 0, 0, 0, 2, 0, 1, 0, 8, 3, 7, 0, 4, b'a', b'b', 0];
+    // Local type 1, little endian, with a developer's field of two bytes and an accuracy.
+    messages.extend([0x61, 0, 0, 20, 0, 4, 253, 4, 0x86, 0, 4, 0x85, 1, 4, 0x85, 31, 1, 2, 1, 0, 2, 0]);
+    messages.push(1);
+    messages.extend([0x3B, 0x95, 0xE8, 0x3B].into_iter().chain(little).chain([5, 0xAA, 0xBB]));
+    // Local type 2, big endian, without a time of its own.
+    messages.extend([0x42, 0, 1, 0, 20, 2, 0, 4, 0x85, 1, 4, 0x85]);
+    for short_time_s in [0x1D, 0x02] {
+        messages.push(0x80 | 2 << 5 | short_time_s);
+        messages.extend(&big);
+    }
+    messages.push(0x80 | 2 << 5 | 0x03);
+    messages.extend([0x7F, 0xFF, 0xFF, 0xFF, 0x7F, 0xFF, 0xFF, 0xFF]);
+    messages
+}
+
+#[test]
+fn records_of_fit_files_are_read_in_both_byte_orders_and_from_files_in_a_row() {
+    let file = fit_file(&fit_messages());
+    let shown_of = |content: &[u8]| {
+        let rows = read_received_fixes(content, FixFormat::Fit, rules().time_bounds).expect("a file");
+        let rows: std::result::Result<Vec<_>, _> = rows.map(|row| row.map(|row| shown(&row))).collect();
+        rows.map_err(|error| error.to_string())
+    };
+    let expected = [
+        "2021-11-06T01:58:19Z - 103.986780 30.628000",
+        "2021-11-06T01:58:21Z - 103.986780 30.628000",
+        "2021-11-06T01:58:26Z - 103.986780 30.628000",
+        "line 4: position_long: is missing: the receiver had no fix",
+    ];
+    let rows = shown_of(&file).expect("a file");
+    assert_eq!(rows, expected);
+    let both = shown_of(&[file.clone(), file.clone()].concat()).expect("two files");
+    assert_eq!((both.len(), &both[4..7]), (8, &rows[..3]), "definitions and times begin again");
+    let first = read_received_fixes(&file[..], FixFormat::Fit, rules().time_bounds).expect("a file").next();
+    let sigma = first.expect("a row").expect("a file").expect("a fix").fix.sigma_m.expect("stated");
+    assert!((sigma.metres() - 5.0 / 1.509_6).abs() < 1e-3);
+
+    let damaged = |change: &dyn Fn(&mut Vec<u8>)| {
+        let mut file = file.clone();
+        change(&mut file);
+        shown_of(&file).expect_err("it is damaged")
+    };
+    assert!(damaged(&|file| file[60] ^= 1).contains("checksum"), "{}", damaged(&|file| file[60] ^= 1));
+    assert!(damaged(&|file| file.truncate(file.len() - 6)).contains("after 3 positions the file breaks off"));
+    assert!(damaged(&|file| file[4..8].fill(0)).contains("was not finished"));
+    assert!(damaged(&|file| file[9] = b'X').contains("is not FIT"));
+    assert!(damaged(&|file| file.clear()).contains("breaks off"));
+    assert!(damaged(&|file| file[12] = 0).contains("no definition"));
+    assert!(damaged(&|file| file[4] = 20).contains("longer than its file"));
+}
+
+/// Lines as releases 2.0 and 3.0 of GnssLogger write them, and the providers' names of GPSTest.
+#[test]
+fn logs_of_gnss_logger_give_the_fixes_of_the_receiver_alone() {
+    let log = "# \n# Header Description:\n# \n# Raw,ElapsedRealtimeMillis,TimeNanos\n\
+        # Fix,Provider,Latitude,Longitude,Altitude,Speed,Accuracy,(UTC)TimeInMs\n\
+        Raw,1,2\nFix,gps,30.628,103.98678,500.1,1.1,4.0,1607927000500\n\
+        #   Fix,Provider,LatitudeDegrees,LongitudeDegrees,AltitudeMeters,SpeedMps,AccuracyMeters,BearingDegrees,UnixTimeMillis,\
+        SpeedAccuracyMps,BearingAccuracyDegrees,elapsedRealtimeNanos,VerticalAccuracyMeters,MockLocation\n\
+        Fix,GPS,30.628,103.98678,500.1,1.1,,20.0,1607927001000,0.1,,1,3.0,0\n\
+        Fix,FLP,30.7,103.9,,,12.0,,1607927001000,,,1,,0\nFix,network,30.7,103.9,,,400.0,,1607927001000,,,1,,0\n\
+        Fix,GPS,30.628,,500.1,1.1,3.8,20.0,1607927002000,0.1,,1,3.0,0\n\
+        Fix,GPS,30.628,103.98678,500.1,1.1,3.8,20.0,1607927003000,0.1,,1,3.0,1\nNMEA,$GPGGA,1\n";
+    let expected = [
+        "2020-12-14T06:23:20.5Z - 103.986780 30.628000",
+        "2020-12-14T06:23:21Z - 103.986780 30.628000",
+        "line 12: LongitudeDegrees: is required, as a number",
+        "line 13: MockLocation: the position is simulated",
+    ];
+    for named_as in [FixFormat::GnssLogger, FixFormat::Nmea] {
+        assert_eq!(all_shown(log, named_as), expected, "{named_as:?}");
+    }
+    let rows = received(log, FixFormat::GnssLogger);
+    let sigma_m = |at: usize| rows[at].as_ref().expect("a fix").fix.sigma_m.map(|sigma| sigma.metres());
+    assert!((sigma_m(0).expect("stated") - 2.650).abs() < 1e-3 && sigma_m(1).is_none());
+    let bare = all_shown("Fix,gps,30.6,103.9\n", FixFormat::GnssLogger);
+    assert!(bare[0].contains("names the columns"), "{bare:?}");
+}
+
 #[test]
 fn leap_seconds_are_those_of_the_date() {
     let file = "%  GPST latitude(deg) longitude(deg)\n2016/12/31 12:00:00 1 2\n2017/01/01 00:00:18 1 2\n";

@@ -1,7 +1,7 @@
 //! Frames of ONVIF's metadata streams of several makers.
 
-use super::messages::read;
-use crate::{DetectedBox, MessageFormat, MessageItem, NamedDetection, Reading};
+use super::messages::{context, read};
+use crate::{DetectedBox, MessageFormat, MessageItem, NamedDetection, Reading, decoder};
 
 fn frame(time: &str, content: &str) -> Reading {
     let stream = format!(
@@ -50,6 +50,8 @@ fn a_part_of_another_object_is_no_target() {
     assert_eq!(only(&reading).target_id.as_str(), "12");
     assert_edges(&reading, [0.1, 0.1, 0.3, 0.5]);
     assert_eq!(reading.skipped, ["object 13 is a part of object 12"]);
+    let alone = object(r#"ObjectId="12" Parent="0""#, "", r#"left="0" top="0" right="1" bottom="-1""#);
+    assert_eq!(only(&frame(TIME, &alone)).target_id.as_str(), "12");
 }
 
 #[test]
@@ -85,4 +87,34 @@ fn times_have_offsets_of_either_sign_or_none() {
     ] {
         assert_eq!(only(&frame(time, &object)).time.to_string(), TIME, "{time}");
     }
+}
+
+/// The example of the Analytics Service Specification (chapter "ONVIF Metadata in JSON over MQTT"), with a class of what the
+/// person carries beside it.
+#[test]
+fn frames_in_json_are_read_as_those_in_xml() {
+    let stream = r##"{"Frame": [{"@UtcTime": "2021-10-05T15:13:27.321", "@Source": "MyClassifier",
+        "@context": {"acme": "http://www.acme.com/schema"},
+        "Transformation": {"Translate": {"@x": -1.0, "@y": -1.0}, "Scale": {"@x": 0.003125, "@y": 0.00416667}},
+        "Object": [{"@ObjectId": 15, "Appearance": {
+            "BarcodeInfo": {"Type": "QRCode"},
+            "Shape": {"BoundingBox": {"@left": 20.0, "@top": 80.0, "@right": 100.0, "@bottom": 30.0},
+                "CenterOfGravity": {"@x": 60.0, "@y": 50.0}},
+            "Class": {"Type": [{"@Likelihood": 0.8, "#text": "Human"}]}}}]}]}"##;
+    let reading = read(MessageFormat::Onvif, stream);
+    let detection = only(&reading);
+    assert_eq!((detection.camera.as_str(), detection.target_id.as_str()), ("MyClassifier", "15"));
+    assert_eq!(detection.time.to_string(), "2021-10-05T15:13:27.321Z");
+    assert_eq!(detection.class.as_ref().map(|class| class.as_str()), Some("Human"));
+    assert_eq!(detection.score.map(|score| score.value()), Some(0.8));
+    // 640 x 480 px with y up.
+    let DetectedBox::Fractions(edges) = detection.detected_box else { panic!("{detection:?}") };
+    for (edge, expected) in edges.into_iter().zip([20.0 / 640.0, 400.0 / 480.0, 100.0 / 640.0, 450.0 / 480.0])
+    {
+        assert!((edge - expected).abs() < 1e-6, "{edges:?}");
+    }
+    assert!(decoder(MessageFormat::Onvif).decode(b"{\"Frame\": [", &context()).is_err());
+    let without_edge = stream.replace("\"@left\": 20.0", "\"@left\": null");
+    let refused = decoder(MessageFormat::Onvif).decode(without_edge.as_bytes(), &context());
+    assert!(refused.is_err_and(|reason| reason.contains("attribute left")));
 }

@@ -24,8 +24,8 @@ pub(super) struct GateOutcome {
     pub(super) innovation: EastNorth,
     pub(super) nis: f64,
     pub(super) rejected: Option<RejectionReason>,
-    /// True if the position reinitialised the filter.
-    pub(super) reinitialized: bool,
+    /// True if the position restarted the filter.
+    pub(super) restarted: bool,
 }
 
 impl GateOutcome {
@@ -36,7 +36,7 @@ impl GateOutcome {
             innovation: EastNorth { east_m: 0.0, north_m: 0.0 },
             nis: f64::NAN,
             rejected: None,
-            reinitialized: false,
+            restarted: false,
         }
     }
 
@@ -52,8 +52,8 @@ pub(super) enum Reacquisition {
     Rejected,
     /// The bias of its source was reset, and it now passes the gate.
     BiasReset,
-    /// The filter was reinitialised from it.
-    Reinitialized,
+    /// The filter was restarted from it.
+    Restarted,
 }
 
 /// Accepted and rejected measurements of one source.

@@ -207,7 +207,7 @@ impl ImmFilter {
             Some(reason) => GateOutcome::unused(MeasurementSource::Fix, reason),
             None if self.awaits_fix && measured.covariance.is_positive() => {
                 self.restart(settings, MeasurementSource::Fix, measured);
-                GateOutcome { reinitialized: true, ..GateOutcome::of(MeasurementSource::Fix) }
+                GateOutcome { restarted: true, ..GateOutcome::of(MeasurementSource::Fix) }
             }
             None => self.gate_and_update(settings, MeasurementSource::Fix, measured, None),
         });
@@ -234,7 +234,7 @@ impl ImmFilter {
             if confirming.is_some_and(|fix| self.is_outside(settings, MeasurementSource::Fix, fix)) {
                 // The track's target id now names another target.
                 self.restart(settings, source, measured);
-                outcome.reinitialized = true;
+                outcome.restarted = true;
                 return outcome;
             }
             match self.reacquire(settings, source, measured, &decomposition, confirming.is_some()) {
@@ -242,8 +242,8 @@ impl ImmFilter {
                     outcome.rejected = Some(RejectionReason::OutsideGate);
                     return outcome;
                 }
-                Reacquisition::Reinitialized => {
-                    outcome.reinitialized = true;
+                Reacquisition::Restarted => {
+                    outcome.restarted = true;
                     return outcome;
                 }
                 Reacquisition::BiasReset => predicted = self.predict_measurement(&decomposition),
@@ -291,9 +291,9 @@ impl ImmFilter {
     }
 
     /// Deals with a measurement beyond the gate. Where those that were rejected agree with each other,
-    /// reinitialises the filter if the other source is not active or confirms this one
+    /// restarts the filter if the other source is not active or confirms this one
     /// (`is_confirmed`). Once its source was rejected often and for long enough: resets the source's
-    /// bias if the other source is active and the measurement then passes the gate; reinitialises the
+    /// bias if the other source is active and the measurement then passes the gate; restarts the
     /// filter if the other source is not active.
     fn reacquire(
         &mut self,
@@ -315,7 +315,7 @@ impl ImmFilter {
         let rejected_s = history.record_rejection(now, settings.reacquire_after_s);
         if is_another {
             self.restart(settings, source, measured);
-            return Reacquisition::Reinitialized;
+            return Reacquisition::Restarted;
         }
         let Some(rejected_s) = rejected_s else { return Reacquisition::Rejected };
         if other_is_active {
@@ -335,7 +335,7 @@ impl ImmFilter {
         let camera_prevails = source == MeasurementSource::Regressed && rejected_s >= ACTIVE_S;
         if !other_is_active || camera_prevails {
             self.restart(settings, source, measured);
-            return Reacquisition::Reinitialized;
+            return Reacquisition::Restarted;
         }
         Reacquisition::Rejected
     }
@@ -435,7 +435,7 @@ impl ImmFilter {
             nis: None,
             innovations: Vec::new(),
             rejected: Vec::new(),
-            reinitialized: false,
+            restarted: false,
             sources_disagree: self.agreement.verdict().disagrees,
         }
     }

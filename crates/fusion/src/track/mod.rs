@@ -249,10 +249,10 @@ impl Track {
         let accepted = outcomes.iter().flatten().filter(|it| it.rejected.is_none());
         state.innovations = accepted
             .clone()
-            .filter(|it| !it.reinitialized)
+            .filter(|it| !it.restarted)
             .map(|it| Innovation { source: it.source, difference: it.innovation, nis: it.nis })
             .collect();
-        state.reinitialized = accepted.clone().any(|it| it.reinitialized);
+        state.restarted = accepted.clone().any(|it| it.restarted);
         state.nis = (!state.innovations.is_empty()).then(|| state.innovations.iter().map(|it| it.nis).sum());
         state.rejected = rejected;
         state

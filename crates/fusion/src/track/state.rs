@@ -42,10 +42,10 @@ pub struct TrackState {
     pub innovations: Vec<Innovation>,
     /// Rejected positions.
     pub rejected: Vec<Rejection>,
-    /// True if this measurement reinitialised the track: box and fix agree with each other and not with the
+    /// True if this measurement restarted the track: box and fix agree with each other and not with the
     /// track, or after a series of rejections that no bias
     /// explains.
-    pub reinitialized: bool,
+    pub restarted: bool,
     /// True if boxes and fixes have lately differed by more than chance explains. `r95_m` then holds the truth
     /// whichever of them is right, or one of them is not used.
     pub sources_disagree: bool,

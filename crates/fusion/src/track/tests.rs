@@ -302,7 +302,7 @@ fn a_source_whose_bias_jumped_is_reacquired_without_a_jump_of_the_position() {
                 }
             }
             let state = track.update(&measurement);
-            assert!(!state.reinitialized);
+            assert!(!state.restarted);
             if index >= 212 {
                 rejected_late += state.rejected.len();
             }
@@ -348,7 +348,7 @@ fn an_id_that_names_another_target_takes_the_track_there_at_once() {
             regressed: moved(measurement.regressed, apart_m),
             ..*measurement
         });
-        assert_eq!(state.reinitialized, index == 60, "{index}");
+        assert_eq!(state.restarted, index == 60, "{index}");
         let truth = EastNorth { east_m: truth.east_m + apart_m, ..*truth };
         assert!(state.position.distance_m(truth) < 6.0, "{index}: {state:?}");
     }
@@ -367,7 +367,7 @@ fn boxes_that_the_fixes_confirm_are_followed_and_others_are_not() {
             track.update(&at(f64::from(second), 0.0));
         }
         let states: Vec<_> = (60..66).map(|second| track.update(&at(f64::from(second), 40.0))).collect();
-        let restarted: Vec<bool> = states.iter().map(|state| state.reinitialized).collect();
+        let restarted: Vec<bool> = states.iter().map(|state| state.restarted).collect();
         assert_eq!(restarted, [false, false, is_followed, false, false, false], "{fix_sigma_m} m");
         let east_m = states[5].position.east_m;
         assert!(if is_followed { (east_m - 40.0).abs() < 3.0 } else { east_m.abs() < 3.0 }, "{east_m}");
@@ -396,7 +396,7 @@ fn false_boxes_leave_a_radius_that_holds() {
 }
 
 #[test]
-fn a_single_source_that_contradicts_the_track_reinitialises_it() {
+fn a_single_source_that_contradicts_the_track_restarts_it() {
     let mut track = Track::start(TrackSettings::default(), &fix_at(0.0, 0.0, 4.0)).expect("a fix");
     for second in 1..30 {
         track.update(&fix_at(f64::from(second), 0.0, 4.0));
@@ -404,7 +404,7 @@ fn a_single_source_that_contradicts_the_track_reinitialises_it() {
     let states: Vec<TrackState> =
         (30..45).map(|second| track.update(&fix_at(f64::from(second), 500.0, 4.0))).collect();
     assert_eq!(states[0].rejected.len(), 1);
-    assert_eq!(states.iter().filter(|state| state.reinitialized).count(), 1);
+    assert_eq!(states.iter().filter(|state| state.restarted).count(), 1);
     let last = states.last().expect("not empty");
     assert!((last.position.east_m - 500.0).abs() < 1.0 && last.rejected.is_empty(), "{last:?}");
 }

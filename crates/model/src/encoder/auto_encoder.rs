@@ -37,26 +37,26 @@ impl OutputScale {
 }
 
 /// `4 - hidden.. - 2 - hidden reversed.. - 4` with hyperbolic tangents.
-pub(super) fn shape(hidden: &[usize]) -> NetShape {
+pub(crate) fn shape(hidden: &[usize]) -> NetShape {
     NetShape::auto_encoder(FEATURE_COUNT, hidden, Activation::Tanh)
 }
 
 /// Samples per step: about 20 steps per epoch of a small set, larger batches for a large one.
-pub(super) fn batch_size(samples: usize) -> usize {
+pub(crate) fn batch_size(samples: usize) -> usize {
     (samples / 20).clamp(16, 512)
 }
 
 /// A trained auto-encoder with its scales.
 #[derive(Debug, Clone)]
-pub(super) struct Trained {
-    pub(super) scales: [Scale; FEATURE_COUNT],
-    pub(super) output: OutputScale,
-    pub(super) shape: NetShape,
-    pub(super) parameters: Vec<f32>,
+pub(crate) struct Trained {
+    pub(crate) scales: [Scale; FEATURE_COUNT],
+    pub(crate) output: OutputScale,
+    pub(crate) shape: NetShape,
+    pub(crate) parameters: Vec<f32>,
 }
 
 /// Trains an auto-encoder by the hybrid loss (1).
-pub(super) fn train(
+pub(crate) fn train(
     rows: &TrainingRows,
     hidden: &[usize],
     epochs: u32,

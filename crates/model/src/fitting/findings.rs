@@ -1,11 +1,11 @@
 //! The findings of a run, in words: each candidate's held-out error, why it was kept or not, and what would
 //! make the model surer.
 
-use super::candidates::Candidate;
 use super::walked_line::is_one_line;
 use crate::artifact::ModelParts;
 use crate::domain::{CandidateFinding, CandidateReport, HeldOutError, ImageSize, TrainingReport};
 use crate::geo::Position;
+use crate::recipes::Candidate;
 use crate::regressor::Regressor;
 use crate::samples::mirroring::{FootPosition, is_mirrored};
 use crate::samples::rows::{TrainingRow, TrainingRows};

@@ -8,8 +8,8 @@
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::candidates::{Candidate, FitContext};
 use crate::progress::{FitError, FitRun, Phase};
+use crate::recipes::{Candidate, FitContext};
 use crate::regressor::Regressor;
 use crate::samples::rows::{TrainingRows, traverses};
 use crate::statistics::median;

@@ -1,7 +1,6 @@
 //! From samples to a model: the candidates are compared on held-out blocks of time, then the best is fitted
 //! to all samples; `site` does so for all cameras of a site at once.
 
-mod candidates;
 mod findings;
 mod gnss_noise;
 mod held_out;

@@ -7,7 +7,6 @@ use std::ops::ControlFlow;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::candidates::{self, Candidate, Estimator, FitContext};
 use super::findings::{Selection, training_report};
 use super::held_out::{choose, cross_validate};
 use super::observed_scene::put_scene;
@@ -21,11 +20,12 @@ use crate::domain::{
     CandidateReport, Detection, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError,
     HeldOutSampleError, ImageSize, ModelMetadata, OriginDeg, Recipe, RunProgress, Sample, TrainingReport,
 };
-use crate::encoder::gaussian_process::target_height_m;
+use crate::encoder::geometry::{GeometricCovariance, fit_geometry};
 use crate::encoder::projection_fit::ParameterCovariance;
-use crate::encoder::projective::{GeometricCovariance, fit_geometry};
 use crate::network::LossWeights;
 use crate::progress::{FitError, FitEvent, FitRun, Phase};
+use crate::recipes::gaussian_process::target_height_m;
+use crate::recipes::{self, Candidate, ErrorSource, FitContext};
 use crate::regressor::Regressor;
 use crate::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
 use crate::samples::unpaired::unpaired_boxes;
@@ -147,8 +147,7 @@ pub fn fit_with<'a>(
 
 /// The candidates of a recipe, or the one of that name.
 fn selected(recipe: Recipe, name: Option<&str>) -> Result<Vec<&'static Candidate>, FitError> {
-    let candidates: Vec<&Candidate> = candidates::of_recipe(recipe)
-        .iter()
+    let candidates: Vec<&Candidate> = recipes::candidates(recipe)
         .filter(|candidate| name.is_none_or(|only| only == candidate.name))
         .collect();
     if candidates.is_empty() {
@@ -274,27 +273,30 @@ impl FinalFit<'_> {
         let mut fitted = candidate.fit(rows, context, &mut phase)?;
         set_image_size(&mut fitted.parts, options.image_size);
         let mut held_out = held_out.clone();
-        if candidate.estimator == Estimator::GaussianProcess {
-            // It has been calibrated on left-out targets of its own.
-            calibrate_reconstruction(&mut fitted.parts, &rows.rows)?;
-            held_out.e_regression_m2 = mean_variance_m2(&fitted.parts, rows)?;
-            held_out.coverage95_of_fixes = coverage_of_fixes(&fitted.parts, rows, residuals)?;
-        } else if candidate.estimator != Estimator::Paper {
-            let geometry = GeometricCovariance::of_geometry(geometry);
-            let validation = HeldOut { rows: &rows.rows, residuals, noise: &context.noise };
-            let calibration = calibrate(&mut fitted, geometry, &validation, options.image_size)?;
-            held_out.e_regression_m2 = calibration.error_m2;
-            widen_radius(&mut fitted.parts, rows, groups, residuals, &context.noise)?;
-            if *e_gnss_source == GnssErrorSource::Estimated {
-                fitted.parts.e_gnss_m2 = calibration.receiver_m2.max(LEAST_GNSS_VARIANCE_M2);
+        match recipes::error_source(fitted.parts.recipe) {
+            ErrorSource::Formula => {}
+            ErrorSource::LeftOutTargets => {
+                calibrate_reconstruction(&mut fitted.parts, &rows.rows)?;
+                held_out.e_regression_m2 = mean_variance_m2(&fitted.parts, rows)?;
+                held_out.coverage95_of_fixes = coverage_of_fixes(&fitted.parts, rows, residuals)?;
             }
-            held_out.coverage95_of_fixes = coverage_of_fixes(&fitted.parts, rows, residuals)?;
+            ErrorSource::HeldOutRows => {
+                let geometry = GeometricCovariance::new(geometry, None);
+                let validation = HeldOut { rows: &rows.rows, residuals, noise: &context.noise };
+                let calibration = calibrate(&mut fitted, geometry, &validation, options.image_size)?;
+                held_out.e_regression_m2 = calibration.error_m2;
+                widen_radius(&mut fitted.parts, rows, groups, residuals, &context.noise)?;
+                if *e_gnss_source == GnssErrorSource::Estimated {
+                    fitted.parts.e_gnss_m2 = calibration.receiver_m2.max(LEAST_GNSS_VARIANCE_M2);
+                }
+                held_out.coverage95_of_fixes = coverage_of_fixes(&fitted.parts, rows, residuals)?;
+            }
         }
         let mut parts = fitted.parts;
         parts.set("fix_scatter_m2", context.noise.variance_m2);
         parts.set("fix_white_share", context.noise.correlation.white_share);
         parts.set("fix_time_constant_s", context.noise.correlation.time_constant_s);
-        parts.set("labels_smoothed", f64::from(u8::from(candidate.is_smoothed())));
+        parts.set("labels_smoothed", f64::from(u8::from(candidate.is_smoothed)));
         let regressor = Regressor::build(parts.clone()).map_err(FitError::fault)?;
         estimate_track_noise(samples, &regressor, &parts).put(&mut parts);
         put_scene(samples, &regressor, &mut parts);

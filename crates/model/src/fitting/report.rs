@@ -1,10 +1,10 @@
 //! The figures and log lines of a fit.
 
-use super::candidates::{Candidate, FitContext};
 use super::held_out::HeldOutResiduals;
 use crate::artifact::ModelParts;
 use crate::domain::{GaussMarkovNoise, HeldOutError, NoiseCorrelation};
 use crate::progress::{FitError, FitRun};
+use crate::recipes::{Candidate, FitContext};
 use crate::regressor::Regressor;
 use crate::samples::rows::TrainingRows;
 use crate::samples::whitening::effective_sample_size;

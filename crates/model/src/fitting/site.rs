@@ -21,11 +21,11 @@ use crate::domain::{
     Recipe, RunProgress, Sample, TrainingReport,
 };
 use crate::encoder::features::features_of;
-use crate::encoder::gaussian_process::{
-    EPOCHS, SHARED_BIAS_SHARE, UprightStarts, target_height_m, widen_map,
-};
 use crate::geo::{EastNorth, LocalPlane};
 use crate::progress::{FitError, FitEvent, FitRun, Phase};
+use crate::recipes::gaussian_process::{
+    EPOCHS, SHARED_BIAS_SHARE, UprightStarts, target_height_m, widen_map,
+};
 use crate::regressor::Regressor;
 use crate::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
 use crate::samples::target_groups::groups_of_targets;

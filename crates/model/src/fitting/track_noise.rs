@@ -4,9 +4,9 @@
 use super::gnss_noise::{TimedResidual, estimate_gnss_noise};
 use crate::artifact::{ModelParts, TrackNoiseModel};
 use crate::domain::{NoiseCorrelation, Sample, SessionBias};
-use crate::encoder::gaussian_process;
 use crate::filters::noise_of_fixes;
 use crate::geo::EastNorth;
+use crate::recipes::gaussian_process;
 use crate::regressor::Regressor;
 use crate::samples::sequences::{fix_sequences, sequences};
 

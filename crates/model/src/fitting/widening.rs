@@ -2,8 +2,8 @@
 
 use crate::artifact::ModelParts;
 use crate::domain::GaussMarkovNoise;
-use crate::encoder::gaussian_process::{Epoch, ReceiverNoise, SequenceMean, weighted_mean, widening};
 use crate::progress::FitError;
+use crate::recipes::gaussian_process::{Epoch, ReceiverNoise, SequenceMean, weighted_mean, widening};
 use crate::regressor::Regressor;
 use crate::samples::rows::{TrainingRow, TrainingRows};
 

@@ -13,14 +13,14 @@ const NO_LIMIT: f32 = 1e30;
 
 /// The position of boxes relative to the training boxes.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct CoverageLookup<'g> {
+pub(crate) struct CoverageLookup<'g> {
     /// Squared distances from all centres, in squared units.
     squared_distances: Expr<'g>,
-    pub(super) extrapolation_ratio: Expr<'g>,
+    pub(crate) extrapolation_ratio: Expr<'g>,
     nominal_m2: Expr<'g>,
 }
 
-pub(super) fn look_up<'g>(table: &CoverageTable, boxes: Boxes<'g>) -> CoverageLookup<'g> {
+pub(crate) fn look_up<'g>(table: &CoverageTable, boxes: Boxes<'g>) -> CoverageLookup<'g> {
     let graph = boxes.sides.graph();
     let centres: Vec<([f32; 4], f32)> = table.centres().collect();
     let [foot_x, foot_y, width, height] = boxes.features();
@@ -45,7 +45,7 @@ pub(super) fn look_up<'g>(table: &CoverageTable, boxes: Boxes<'g>) -> CoverageLo
 }
 
 /// Where boxes are unlike those of training.
-pub(super) fn is_outside_training<'g>(
+pub(crate) fn is_outside_training<'g>(
     model: &ErrorModel,
     lookup: &CoverageLookup<'g>,
     reconstruction_error: Expr<'g>,
@@ -57,7 +57,7 @@ pub(super) fn is_outside_training<'g>(
 }
 
 /// Reconstruction error and error variance per axis, m2.
-pub(super) fn error_of<'g>(
+pub(crate) fn error_of<'g>(
     model: &ErrorModel,
     boxes: Boxes<'g>,
     lookup: &CoverageLookup<'g>,

@@ -11,7 +11,7 @@ use super::messages::{AttributeProto, DOUBLE, GraphProto, INT, INT64, NodeProto,
 
 /// A graph under construction.
 #[derive(Debug, Default)]
-pub(super) struct Graph(RefCell<Parts>);
+pub(crate) struct Graph(RefCell<Parts>);
 
 #[derive(Debug, Default)]
 struct Parts {
@@ -21,7 +21,7 @@ struct Parts {
 
 /// A value of a graph.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Expr<'g> {
+pub(crate) struct Expr<'g> {
     graph: &'g Graph,
     name: Name,
 }
@@ -36,10 +36,10 @@ enum Name {
 
 /// A condition, by element.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Condition<'g>(Expr<'g>);
+pub(crate) struct Condition<'g>(Expr<'g>);
 
 /// A value or a number.
-pub(super) trait Operand<'g> {
+pub(crate) trait Operand<'g> {
     fn on(self, graph: &'g Graph) -> Expr<'g>;
 }
 
@@ -67,19 +67,19 @@ impl std::fmt::Display for Name {
 
 impl Graph {
     /// The input of that name.
-    pub(super) const fn input(&self, name: &'static str) -> Expr<'_> {
+    pub(crate) const fn input(&self, name: &'static str) -> Expr<'_> {
         Expr { graph: self, name: Name::Input(name) }
     }
 
     /// A constant of that shape, row by row.
-    pub(super) fn constant(&self, shape: &[usize], numbers: &[f64]) -> Expr<'_> {
+    pub(crate) fn constant(&self, shape: &[usize], numbers: &[f64]) -> Expr<'_> {
         debug_assert_eq!(shape.iter().product::<usize>(), numbers.len(), "numbers and shape must agree");
         let bytes = numbers.iter().flat_map(|number| number.to_le_bytes()).collect();
         self.tensor(shape, DOUBLE, bytes)
     }
 
     /// A constant of one row.
-    pub(super) fn row(&self, numbers: &[f64]) -> Expr<'_> {
+    pub(crate) fn row(&self, numbers: &[f64]) -> Expr<'_> {
         self.constant(&[1, numbers.len()], numbers)
     }
 
@@ -117,12 +117,12 @@ impl Graph {
     }
 
     /// The columns of some values side by side.
-    pub(super) fn columns<'g>(&'g self, values: &[Expr<'g>]) -> Expr<'g> {
+    pub(crate) fn columns<'g>(&'g self, values: &[Expr<'g>]) -> Expr<'g> {
         self.node("Concat", values, &[("axis", 1)])
     }
 
     /// Names the value of an output.
-    pub(super) fn output(&self, value: Expr<'_>, name: &str) {
+    pub(crate) fn output(&self, value: Expr<'_>, name: &str) {
         self.node("Identity", &[value], &[]);
         if let Some(node) = self.0.borrow_mut().nodes.last_mut() {
             node.output = vec![name.to_owned()];
@@ -156,95 +156,95 @@ impl<'g> Expr<'g> {
     }
 
     /// The graph that it is part of.
-    pub(super) const fn graph(self) -> &'g Graph {
+    pub(crate) const fn graph(self) -> &'g Graph {
         self.graph
     }
 
-    pub(super) fn max(self, other: impl Operand<'g>) -> Self {
+    pub(crate) fn max(self, other: impl Operand<'g>) -> Self {
         self.binary("Max", other)
     }
 
-    pub(super) fn min(self, other: impl Operand<'g>) -> Self {
+    pub(crate) fn min(self, other: impl Operand<'g>) -> Self {
         self.binary("Min", other)
     }
 
-    pub(super) fn clamp(self, low: f64, high: f64) -> Self {
+    pub(crate) fn clamp(self, low: f64, high: f64) -> Self {
         self.max(low).min(high)
     }
 
     /// The positive part.
-    pub(super) fn positive(self) -> Self {
+    pub(crate) fn positive(self) -> Self {
         self.max(0.0)
     }
 
-    pub(super) fn exp(self) -> Self {
+    pub(crate) fn exp(self) -> Self {
         self.unary("Exp")
     }
 
-    pub(super) fn ln(self) -> Self {
+    pub(crate) fn ln(self) -> Self {
         self.unary("Log")
     }
 
-    pub(super) fn sqrt(self) -> Self {
+    pub(crate) fn sqrt(self) -> Self {
         self.unary("Sqrt")
     }
 
-    pub(super) fn tanh(self) -> Self {
+    pub(crate) fn tanh(self) -> Self {
         self.unary("Tanh")
     }
 
-    pub(super) fn sin(self) -> Self {
+    pub(crate) fn sin(self) -> Self {
         self.unary("Sin")
     }
 
-    pub(super) fn cos(self) -> Self {
+    pub(crate) fn cos(self) -> Self {
         self.unary("Cos")
     }
 
-    pub(super) fn square(self) -> Self {
+    pub(crate) fn square(self) -> Self {
         self * self
     }
 
     /// The product with a constant matrix, row by row.
-    pub(super) fn matrix_product(self, rows: usize, columns: usize, numbers: &[f64]) -> Self {
+    pub(crate) fn matrix_product(self, rows: usize, columns: usize, numbers: &[f64]) -> Self {
         self.binary("MatMul", self.graph.constant(&[rows, columns], numbers))
     }
 
     /// The sum over the columns of each row, as one column.
-    pub(super) fn sum(self) -> Self {
+    pub(crate) fn sum(self) -> Self {
         self.graph.node("ReduceSum", &[self, self.graph.integers(&[1])], &[("keepdims", 1)])
     }
 
     /// The smallest number of each row, as one column.
-    pub(super) fn least(self) -> Self {
+    pub(crate) fn least(self) -> Self {
         self.graph.node("ReduceMin", &[self, self.graph.integers(&[1])], &[("keepdims", 1)])
     }
 
     /// One column.
-    pub(super) fn column(self, at: usize) -> Self {
+    pub(crate) fn column(self, at: usize) -> Self {
         self.graph.node("Gather", &[self, self.graph.integers(&[at])], &[("axis", 1)])
     }
 
     /// The first columns, one by one.
-    pub(super) fn split<const N: usize>(self) -> [Self; N] {
+    pub(crate) fn split<const N: usize>(self) -> [Self; N] {
         std::array::from_fn(|at| self.column(at))
     }
 
     /// The row of a table (`width` numbers each) at the index of the least column of each row.
-    pub(super) fn row_of_least(self, width: usize, table: &[f64]) -> Self {
+    pub(crate) fn row_of_least(self, width: usize, table: &[f64]) -> Self {
         let least = self.graph.node("ArgMin", &[self], &[("axis", 1), ("keepdims", 0)]);
         let table = self.graph.constant(&[table.len() / width, width], table);
         self.graph.node("Gather", &[table, least], &[("axis", 0)])
     }
 
-    pub(super) fn exceeds(self, other: impl Operand<'g>) -> Condition<'g> {
+    pub(crate) fn exceeds(self, other: impl Operand<'g>) -> Condition<'g> {
         Condition(self.binary("Greater", other))
     }
 }
 
 impl<'g> Condition<'g> {
     /// One value where the condition holds, another elsewhere.
-    pub(super) fn choose(self, then: impl Operand<'g>, otherwise: impl Operand<'g>) -> Expr<'g> {
+    pub(crate) fn choose(self, then: impl Operand<'g>, otherwise: impl Operand<'g>) -> Expr<'g> {
         let graph = self.0.graph;
         graph.node("Where", &[self.0, then.on(graph), otherwise.on(graph)], &[])
     }

@@ -5,31 +5,29 @@
 //! earlier boxes of its target. Input and outputs are those of the inference protocol (`app::inference`), and the
 //! position in metres besides. ONNX has no pre- or post-processing to agree upon: pixels go in, metres come out.
 //!
-//! The files in the order of their layers: `messages`, `expression`, `boxes`, `network`, the recipes and the error
-//! model, this one.
+//! The files in the order of their layers: `messages`, `expression`, `boxes`, `network`, the error model, `answer`, the
+//! encoders of the recipes (`recipes/*/onnx.rs`), this one.
 
-mod boxes;
+pub(crate) mod answer;
+pub(crate) mod boxes;
 mod error_model;
-mod expression;
-mod gaussian_process;
+pub(crate) mod expression;
 mod messages;
-mod network;
-mod paper;
-mod plane;
-mod projective;
+pub(crate) mod network;
+pub(crate) mod plane;
 mod scene;
 
 use bytes::Bytes;
 use prost::Message as _;
 
-use self::boxes::{BOXES, Boxes, reconstruction_error};
-use self::expression::{Expr, Graph};
+use self::answer::{Answer, GraphContext};
+use self::boxes::{BOXES, Boxes};
+use self::expression::Graph;
 use self::messages::{
     DOUBLE, DimensionProto, ModelProto, OperatorSetIdProto, StringStringEntryProto, TensorShapeProto,
     TensorTypeProto, TypeProto, ValueInfoProto,
 };
 use super::artifact::Artifact;
-use super::encoder::Encoder;
 use super::regressor::{Regressor, VARIANCE_RANGE_M2};
 use crate::domain::{ModelMetadata, Result};
 
@@ -83,23 +81,18 @@ impl Artifact {
     }
 }
 
-/// The position of boxes and its error, before the limits of [`Regressor::regress`].
-struct Answer<'g> {
-    /// East and north of the origin, m.
-    position_m: [Expr<'g>; 2],
-    /// Longitude (not wrapped) and latitude.
-    position_deg: [Expr<'g>; 2],
-    /// East, cross, north, m2.
-    covariance_m2: [Expr<'g>; 3],
-    r95_scale: Expr<'g>,
-    reconstruction_error: Expr<'g>,
-}
-
 fn put_outputs(regressor: &Regressor, graph: &Graph) {
     let boxes = Boxes::of(graph);
     let lookup = error_model::look_up(&regressor.error_model.coverage, boxes);
+    let context = GraphContext {
+        plane: regressor.plane(),
+        error_model: &regressor.error_model,
+        r95_scale: regressor.r95_scale,
+        boxes,
+        lookup,
+    };
     let Answer { position_m, position_deg, covariance_m2, r95_scale, reconstruction_error } =
-        answer(regressor, boxes, &lookup);
+        regressor.encoder.express(&context);
     let (position_m, position_deg, covariance_m2) = match &regressor.scene {
         Some(scene) => {
             let ratio = lookup.extrapolation_ratio;
@@ -129,56 +122,6 @@ fn put_outputs(regressor: &Regressor, graph: &Graph) {
     ];
     for (value, (name, ..)) in values.into_iter().zip(OUTPUTS) {
         graph.output(value, name);
-    }
-}
-
-fn answer<'g>(
-    regressor: &Regressor,
-    boxes: Boxes<'g>,
-    lookup: &error_model::CoverageLookup<'g>,
-) -> Answer<'g> {
-    let graph = boxes.sides.graph();
-    let isotropic = |variance_m2: Expr<'g>| [variance_m2, variance_m2 * 0.0, variance_m2];
-    let of_error_model = |(position_m, reconstruction_px): (Expr<'g>, Expr<'g>)| {
-        let (reconstruction_error, variance_m2) =
-            error_model::error_of(&regressor.error_model, boxes, lookup, reconstruction_px);
-        let position_m: [Expr<'g>; 2] = position_m.split();
-        Answer {
-            position_m,
-            position_deg: plane::to_position(regressor.plane(), position_m),
-            covariance_m2: isotropic(variance_m2),
-            r95_scale: graph.row(&[regressor.r95_scale]),
-            reconstruction_error,
-        }
-    };
-    match &regressor.encoder {
-        Encoder::Paper(paper) => {
-            let estimate = paper::estimate(paper, regressor.plane().origin(), boxes);
-            let [east_deg, _] = estimate.offset_deg;
-            Answer {
-                position_m: plane::to_plane(regressor.plane(), east_deg, estimate.position_deg[1]),
-                position_deg: estimate.position_deg,
-                covariance_m2: isotropic(estimate.variance_m2),
-                r95_scale: graph.row(&[regressor.r95_scale]),
-                reconstruction_error: estimate.reconstruction_error,
-            }
-        }
-        Encoder::Hybrid(hybrid) => of_error_model(network::auto_encoder(&hybrid.0, boxes)),
-        Encoder::Projective(projective) => of_error_model(projective::encode(projective, boxes)),
-        Encoder::GaussianProcess(map) => {
-            let estimate = gaussian_process::estimate(&map.predictor, boxes);
-            let reconstruction_px = match &map.auto_encoder {
-                Some(auto_encoder) => network::auto_encoder(auto_encoder, boxes).1,
-                None => graph.columns(&estimate.plausible_px),
-            };
-            Answer {
-                position_m: estimate.position_m,
-                position_deg: plane::to_position(regressor.plane(), estimate.position_m),
-                covariance_m2: estimate.covariance_m2,
-                r95_scale: estimate.r95_scale,
-                reconstruction_error: reconstruction_error(boxes.features(), reconstruction_px),
-            }
-        }
     }
 }
 

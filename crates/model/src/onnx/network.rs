@@ -8,17 +8,17 @@ use crate::encoder::auto_encoder::AutoEncoder;
 use crate::network::{Activation, Net};
 
 /// The bottleneck's two units.
-pub(super) fn encode<'g>(net: &Net, inputs: Expr<'g>) -> Expr<'g> {
+pub(crate) fn encode<'g>(net: &Net, inputs: Expr<'g>) -> Expr<'g> {
     run(net, 0..net.shape().bottleneck(), inputs)
 }
 
 /// The reconstructed inputs of the bottleneck's units.
-pub(super) fn decode<'g>(net: &Net, bottleneck: Expr<'g>) -> Expr<'g> {
+pub(crate) fn decode<'g>(net: &Net, bottleneck: Expr<'g>) -> Expr<'g> {
     run(net, net.shape().bottleneck()..net.shape().layers().len(), bottleneck)
 }
 
 /// The units of the first hidden layer.
-pub(super) fn first_hidden<'g>(net: &Net, inputs: Expr<'g>) -> Expr<'g> {
+pub(crate) fn first_hidden<'g>(net: &Net, inputs: Expr<'g>) -> Expr<'g> {
     run(net, 0..1, inputs)
 }
 
@@ -41,7 +41,7 @@ fn f64s(numbers: &[f32]) -> Vec<f64> {
 }
 
 /// Position (east and north, m) and reconstructed features (px) of an auto-encoder.
-pub(super) fn auto_encoder<'g>(encoder: &AutoEncoder, boxes: Boxes<'g>) -> (Expr<'g>, Expr<'g>) {
+pub(crate) fn auto_encoder<'g>(encoder: &AutoEncoder, boxes: Boxes<'g>) -> (Expr<'g>, Expr<'g>) {
     let graph = boxes.sides.graph();
     let bottleneck = encode(&encoder.net, scaled(boxes.features(), &encoder.scales));
     let outputs = decode(&encoder.net, bottleneck);

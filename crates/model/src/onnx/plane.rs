@@ -8,7 +8,7 @@ use crate::geo::{ECCENTRICITY_SQUARED, EQUATORIAL_RADIUS_M, LocalPlane, R95_BY_R
 const ARC_TANGENT_TERMS: i32 = 11;
 
 /// Longitude and latitude (degrees) of points east and north of the origin, m: `LocalPlane::to_position`.
-pub(super) fn to_position<'g>(plane: &LocalPlane, [east_m, north_m]: [Expr<'g>; 2]) -> [Expr<'g>; 2] {
+pub(crate) fn to_position<'g>(plane: &LocalPlane, [east_m, north_m]: [Expr<'g>; 2]) -> [Expr<'g>; 2] {
     let constants = plane.constants();
     let polar_squared = 1.0 - ECCENTRICITY_SQUARED;
     let outward =
@@ -33,7 +33,7 @@ pub(super) fn to_position<'g>(plane: &LocalPlane, [east_m, north_m]: [Expr<'g>; 
 }
 
 /// East and north of the origin, m, of longitudes given from the origin and latitudes, degrees: `LocalPlane::to_plane`.
-pub(super) fn to_plane<'g>(plane: &LocalPlane, east_deg: Expr<'g>, latitude_deg: Expr<'g>) -> [Expr<'g>; 2] {
+pub(crate) fn to_plane<'g>(plane: &LocalPlane, east_deg: Expr<'g>, latitude_deg: Expr<'g>) -> [Expr<'g>; 2] {
     let constants = plane.constants();
     let radians = |degrees: Expr<'g>| degrees * 1.0_f64.to_radians();
     let (sin_latitude, cos_latitude) = (radians(latitude_deg).sin(), radians(latitude_deg).cos());
@@ -46,7 +46,7 @@ pub(super) fn to_plane<'g>(plane: &LocalPlane, east_deg: Expr<'g>, latitude_deg:
 }
 
 /// Longitudes wrapped into -180 to 180 degrees.
-pub(super) fn wrapped(longitude_deg: Expr<'_>) -> Expr<'_> {
+pub(crate) fn wrapped(longitude_deg: Expr<'_>) -> Expr<'_> {
     let lower = longitude_deg.exceeds(180.0).choose(longitude_deg - 360.0, longitude_deg);
     (-180.0 - lower).exceeds(0.0).choose(lower + 360.0, lower)
 }
@@ -68,7 +68,7 @@ fn arc_tangent_deg<'g>(y: Expr<'g>, x: Expr<'g>) -> Expr<'g> {
 }
 
 /// `PlaneCovariance::r95_m` of east, cross and north, m2.
-pub(super) fn r95_m<'g>([east_m2, cross_m2, north_m2]: [Expr<'g>; 3]) -> Expr<'g> {
+pub(crate) fn r95_m<'g>([east_m2, cross_m2, north_m2]: [Expr<'g>; 3]) -> Expr<'g> {
     let mean_m2 = (east_m2 + north_m2) * 0.5;
     let half_difference = (((east_m2 - north_m2) * 0.5).square() + cross_m2.square()).sqrt();
     let major_m2 = mean_m2 + half_difference;
@@ -77,7 +77,7 @@ pub(super) fn r95_m<'g>([east_m2, cross_m2, north_m2]: [Expr<'g>; 3]) -> Expr<'g
 }
 
 /// The values at the knots 0, 1, 2 ..., linear between them.
-pub(super) fn piecewise_linear<'g>(at: Expr<'g>, values: &[f64]) -> Expr<'g> {
+pub(crate) fn piecewise_linear<'g>(at: Expr<'g>, values: &[f64]) -> Expr<'g> {
     let slope = |knot: usize| values[knot + 1] - values[knot];
     (1..values.len() - 1).fold(at * slope(0) + values[0], |sum, knot| {
         sum + (at - knot as f64).positive() * (slope(knot) - slope(knot - 1))

@@ -190,7 +190,7 @@ impl TrainingRows {
         blocks
     }
 
-    /// At most about so many of the rows: runs of neighbours in time, evenly spaced, since the noise of
+    /// At most about this number of the rows: runs of neighbours in time, evenly spaced, since the noise of
     /// receivers and detectors shows between neighbours.
     pub(crate) fn thinned(self, most: usize) -> Self {
         let stride = self.rows.len().div_ceil(most).max(1);

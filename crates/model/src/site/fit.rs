@@ -9,8 +9,8 @@ use super::input::{FEWEST_ROWS, SiteFitError, SiteFitInput, SiteFix, SitePair, f
 use super::least_squares::{FixRow, LeastSquaresProblem, Transfer};
 use super::maps::SiteMaps;
 use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
-use crate::encoder::gaussian_process::projective_mean::Box4;
-use crate::encoder::gaussian_process::{FootPrior, UprightGeometry, UprightStarts};
+use crate::recipes::gaussian_process::projective_mean::Box4;
+use crate::recipes::gaussian_process::{FootPrior, UprightGeometry, UprightStarts};
 use crate::statistics::median;
 
 /// Standard deviation per axis of the fixes and of the feet before they are estimated, m and px.

@@ -2,8 +2,8 @@
 
 use nalgebra::{Matrix2, Vector2};
 
-use crate::encoder::gaussian_process::projective_mean::{Box4, FOOT_COEFFICIENTS, ProjectiveMean};
 use crate::geo::EastNorth;
+use crate::recipes::gaussian_process::projective_mean::{Box4, FOOT_COEFFICIENTS, ProjectiveMean};
 
 /// Parameters of one map.
 pub(super) const PARAMETERS: usize = FOOT_COEFFICIENTS;

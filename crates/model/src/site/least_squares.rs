@@ -16,8 +16,8 @@ use nalgebra::{DMatrix, DVector, Matrix2, SVector, Vector2};
 use super::ground_map::{GroundMap, GroundTangent, PARAMETERS};
 use super::input::SiteFitError;
 use crate::domain::GaussMarkovNoise;
-use crate::encoder::gaussian_process::projective_mean::Box4;
-use crate::encoder::gaussian_process::{Epoch, FootPrior, ReceiverNoise, ReceiverWhitener};
+use crate::recipes::gaussian_process::projective_mean::Box4;
+use crate::recipes::gaussian_process::{Epoch, FootPrior, ReceiverNoise, ReceiverWhitener};
 
 /// Share of the transfers that counts as independent: a detector's error lasts for some frames.
 const INDEPENDENT_TRANSFERS: f64 = 0.25;

@@ -5,8 +5,8 @@ use nalgebra::{DMatrix, Matrix2, Vector2};
 use super::ground_map::{GroundMap, PARAMETERS};
 use super::input::{foot_and_size, is_foot_cut};
 use crate::domain::{BoundingBox, GaussMarkovNoise, ImageSize};
-use crate::encoder::gaussian_process::{FittedFootMap, FootCovariance};
 use crate::geo::{EastNorth, PlaneCovariance};
+use crate::recipes::gaussian_process::{FittedFootMap, FootCovariance};
 
 /// Standard deviation of the foot of a box that the image border cuts, relative to its height.
 const CUT_FOOT_SHARE: f64 = 0.25;

@@ -7,7 +7,7 @@ use super::ground_map::{GroundMap, PARAMETERS};
 use super::maps::{SiteMaps, SitePosition};
 use crate::artifact::ModelParts;
 use crate::domain::{BoundingBox, Error, GaussMarkovNoise, ImageSize, Result, RunId};
-use crate::encoder::gaussian_process::projective_mean::{COEFFICIENTS, ProjectiveMean};
+use crate::recipes::gaussian_process::projective_mean::{COEFFICIENTS, ProjectiveMean};
 use crate::site::input::RECEIVER_CORRELATION;
 
 /// Scales 8, centre 2, spread, coefficients 8.

@@ -10,11 +10,12 @@ use super::variance_components::{
 };
 use crate::artifact::ModelParts;
 use crate::domain::{BoundingBox, GaussMarkovNoise, ImageSize};
+use crate::encoder::FittedEncoder;
 use crate::encoder::features::{Encoded, reconstruction_error};
-use crate::encoder::projective::GeometricCovariance;
-use crate::encoder::{Encoder, FittedEncoder};
+use crate::encoder::geometry::GeometricCovariance;
 use crate::geo::EastNorth;
 use crate::progress::FitError;
+use crate::recipes;
 use crate::samples::rows::{HELD_OUT_BLOCKS, TrainingRow};
 use crate::samples::second_differences::{MEAN_SQUARE_PER_VARIANCE, second_differences, trimmed_mean};
 use crate::samples::whitening::effective_sample_size;
@@ -69,7 +70,7 @@ pub(crate) fn calibrate(
     let HeldOut { rows, residuals, noise } = *held_out;
     let FittedEncoder { parts, covariance } = fitted;
     let covariance = covariance.get_or_insert(geometry);
-    let encoder = Encoder::build(&mut parts.clone()).map_err(FitError::fault)?;
+    let encoder = recipes::load(&mut parts.clone()).map_err(FitError::fault)?;
     let plane = parts.plane;
     let encode = |bounding_box: &BoundingBox| encoder.encode(&plane, bounding_box);
     let coverage = Coverage::new(rows.iter().map(|row| row.bounding_box));
@@ -181,7 +182,7 @@ fn border_factor(rows: &[TrainingRow], image_size: Option<ImageSize>) -> f64 {
 /// # Errors
 /// [`FitError::Fault`] if the fitted encoder cannot be used.
 pub(crate) fn calibrate_reconstruction(parts: &mut ModelParts, rows: &[TrainingRow]) -> Result<(), FitError> {
-    let encoder = Encoder::build(&mut parts.clone()).map_err(FitError::fault)?;
+    let encoder = recipes::load(&mut parts.clone()).map_err(FitError::fault)?;
     let encoded: Vec<Encoded> =
         rows.iter().map(|row| encoder.encode(&parts.plane, &row.bounding_box)).collect();
     parts.set("reconstruction_usual", nominal_reconstruction_error(rows, &encoded));

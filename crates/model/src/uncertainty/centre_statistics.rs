@@ -2,7 +2,7 @@
 
 use super::coverage::Coverage;
 use super::jacobian::{Encode, edge_variance_m2, foot_variance_m2, jacobian_at};
-use crate::encoder::projective::GeometricCovariance;
+use crate::encoder::geometry::GeometricCovariance;
 use crate::samples::rows::TrainingRow;
 
 /// One value per centre, except for `of_row`.

@@ -13,7 +13,7 @@
 use super::coverage::{Coverage, CoverageLookup, CoverageTable};
 use super::local_boxes::LocalBoxModel;
 use crate::artifact::ModelParts;
-use crate::domain::{BoundingBox, ImageSize, Recipe, Result};
+use crate::domain::{BoundingBox, ImageSize, Result};
 use crate::encoder::features::{Encoded, reconstruction_error};
 use crate::statistics::R95_PER_SIGMA;
 
@@ -64,20 +64,18 @@ pub(crate) struct BoxError {
 }
 
 impl ErrorModel {
-    /// Takes the error model's tensors out of the parts of a model.
+    /// Takes the error model's tensors out of the parts of a model; `is_formula` is true if the recipe has a formula
+    /// of its own for the error, and the parts no parameters of a calibration.
     ///
     /// # Errors
     /// Names the tensor or parameter that is missing or cannot be used.
-    pub(crate) fn build(parts: &mut ModelParts) -> Result<Self> {
+    pub(crate) fn build(parts: &mut ModelParts, is_formula: bool) -> Result<Self> {
         let coverage = Coverage::take(&mut parts.tensors)?;
         let local_boxes = LocalBoxModel::take(&mut parts.tensors, &coverage)?;
-        let (nominal_reconstruction_error, border_factor) = match parts.recipe {
-            // The paper's error is Es eX alone.
-            Recipe::Paper => (0.0, 1.0),
-            _ => (
-                parts.positive_parameter("reconstruction_usual")?,
-                parts.positive_parameter("border_factor")?,
-            ),
+        let (nominal_reconstruction_error, border_factor) = if is_formula {
+            (0.0, 1.0)
+        } else {
+            (parts.positive_parameter("reconstruction_usual")?, parts.positive_parameter("border_factor")?)
         };
         let mut excess = [ExcessCalibration { limit_m2: 0.0, factor: 1.0 }; 2];
         for (excess, [limit, factor]) in excess.iter_mut().zip(EXCESS_PARAMETERS) {

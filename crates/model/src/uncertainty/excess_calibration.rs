@@ -30,7 +30,7 @@ pub(super) fn calibrate_excess(
     effective_size: f64,
     encode: &Encode<'_>,
 ) -> Result<()> {
-    let model = ErrorModel::build(&mut parts.clone())?;
+    let model = ErrorModel::build(&mut parts.clone(), false)?;
     let excesses: Vec<(TruncationClass, f64)> = rows
         .iter()
         .map(|row| {

@@ -19,7 +19,7 @@ impl Database {
         )
         .bind(key)
         .bind(moved.model_version)
-        .bind(moved.began_at.as_microsecond())
+        .bind(moved.onset_at.as_microsecond())
         .bind(moved.raised_at.as_microsecond())
         .bind(moved.shift_east_m)
         .bind(moved.shift_north_m)

@@ -280,6 +280,28 @@ impl NodeLeases {
         owner(&mut reader, camera, site.flatten(), None).await
     }
 
+    /// The fences of the latest owners of a camera and of the cameras of a site.
+    ///
+    /// # Errors
+    /// As [`NodeLeases::register`].
+    pub async fn latest_fences(
+        &self,
+        camera: Option<CameraKey>,
+        site: Option<SiteKey>,
+    ) -> Result<Vec<(CameraKey, i64)>> {
+        let mut reader = begin_read(&self.pool).await?;
+        let fences: Vec<(i64, i64)> = sqlx::query_as(
+            "SELECT camera_key, fence FROM camera_owners \
+             WHERE camera_key = $1 OR camera_key IN (SELECT key FROM cameras WHERE site_key = $2)",
+        )
+        .bind(camera.map(|key| key.0))
+        .bind(site.map(|key| key.0))
+        .fetch_all(&mut *reader)
+        .await
+        .map_err(failed)?;
+        Ok(fences.into_iter().map(|(key, fence)| (CameraKey(key), fence)).collect())
+    }
+
     /// The registered node that owns cameras of a site.
     ///
     /// # Errors

@@ -98,7 +98,7 @@ impl Store {
         Ok(names.into_iter().filter(|name| is_week(table, name)).collect())
     }
 
-    /// Counts the samples of a detached week no more, and drops it; returns how many there were.
+    /// Subtracts the samples of a detached week from the counts, and drops it; returns how many there were.
     async fn drop_detached(
         &self,
         actor: &Actor,

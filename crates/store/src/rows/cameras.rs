@@ -100,7 +100,7 @@ pub(crate) fn read_camera(row: &StoredRow) -> Result<Camera> {
     Ok(Camera { key, profile, revision, created_at, updated_at, active_model, samples })
 }
 
-/// What no statement asks for of a profile, as it is stored. A field that was added later is missing in older rows.
+/// The stored part of a profile that no statement asks for. A field that was added later is missing in older rows.
 #[derive(Serialize, Deserialize)]
 struct StoredProfile {
     display_name: String,

@@ -102,7 +102,7 @@ pub(crate) fn read_move(row: &StoredRow) -> Result<CameraMoved> {
     let mut fields = RowDecoder::new("camera_moves", row).skip(1);
     Ok(CameraMoved {
         model_version: fields.count()?,
-        began_at: fields.timestamp()?,
+        onset_at: fields.timestamp()?,
         raised_at: fields.timestamp()?,
         shift_east_m: fields.get()?,
         shift_north_m: fields.get()?,

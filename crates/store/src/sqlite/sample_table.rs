@@ -132,7 +132,7 @@ pub(super) async fn delete_replaced(
     Ok(deleted)
 }
 
-/// Deletes the samples of a camera in a table that have the keys of these, and counts them no more; returns
+/// Deletes the samples of a camera in a table that have the keys of these, and subtracts them from the counts; returns
 /// how many.
 pub(super) async fn delete_stored(
     connection: &mut SqliteConnection,

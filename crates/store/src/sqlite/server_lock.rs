@@ -2,7 +2,7 @@
 //!
 //! Commands beside a server change rows that the server sees within seconds. Two servers would each run the
 //! jobs, track the targets and grant the quotas of the other. The lock is advisory and ends with its process,
-//! however it ends, so a killed server leaves nothing behind that must be cleared.
+//! however it ends, so a killed server leaves nothing that must be cleared.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Write as _};

@@ -37,7 +37,7 @@ pub(super) struct Writer {
 struct OpenConnection {
     connection: SqliteConnection,
     /// The mode of the connection; `None` while it is being changed, so that a caller that is
-    /// cancelled half way leaves no wrong assumption behind.
+    /// cancelled half way leaves no wrong assumption.
     mode: Option<ConnectionMode>,
     /// A transaction could not begin, and no other process held the file.
     broken: bool,

@@ -1,4 +1,4 @@
-//! The oldest samples of a camera are deleted, and counted no more.
+//! Deletion of the oldest samples of a camera, which are subtracted from the counts.
 
 use sqlx::AssertSqlSafe;
 
@@ -59,7 +59,7 @@ async fn oldest_time(
         .await
 }
 
-/// Deletes the samples of a camera up to an instant, and counts them no more; returns how many.
+/// Deletes the samples of a camera up to an instant, and subtracts them from the counts; returns how many.
 async fn delete_upto(session: &mut dyn Session, camera_key: i64, newest_deleted_us: i64) -> Result<u64> {
     let mut all = 0;
     for table in SampleTable::ALL {

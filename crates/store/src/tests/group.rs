@@ -18,14 +18,14 @@ pub(crate) async fn hold(store: &Store) -> Box<dyn Send + '_> {
     on_backend!(store, store => store.hold().await)
 }
 
-/// Waits until all but the first of so many calls are queued: they share its transaction.
+/// Waits until all but the first of this number of calls are queued: they share its transaction.
 async fn queued(store: &Store, calls: usize) {
     while on_backend!(store, store => store.waiting()) + 1 < calls {
         tokio::task::yield_now().await;
     }
 }
 
-/// Lets groups be stored once so many calls are queued.
+/// Lets groups be stored once this number of calls is queued.
 pub(crate) async fn release(store: &Store, held: Box<dyn Send + '_>, calls: usize) {
     queued(store, calls).await;
     drop(held);

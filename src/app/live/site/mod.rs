@@ -71,7 +71,8 @@ impl App {
     async fn readable_site(&self, id: &SiteId) -> Result<Arc<ActiveSite>> {
         let site = self.active_site(id).await?;
         self.check_site_readable(id, site.key).await?;
-        Ok(site)
+        // Its live state may be a new one.
+        self.active_site(id).await
     }
 
     /// A site in memory; looks into the store for one that another process has created.

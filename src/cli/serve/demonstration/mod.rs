@@ -50,11 +50,11 @@ fn places() -> [Place; 3] {
 
 /// Fills the data folder if it is empty, trains the cameras, and prints requests to try.
 pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
-    if app.cameras(None, None, 1).await?.items.is_empty() {
+    if app.cameras().list(None, None, 1).await?.items.is_empty() {
         create(app).await?;
     }
     let id = CameraId::new(CAMERA)?;
-    app.camera(&id).await.context("the data folder holds other cameras; choose an empty one")?;
+    app.cameras().get(&id).await.context("the data folder holds other cameras; choose an empty one")?;
     train(app).await?;
     let samples = app.samples(&id, &SampleFilter::default(), None, 1).await?.items;
     let sample = samples.into_iter().next().context("the camera of the demonstration has no sample")?;
@@ -66,7 +66,7 @@ pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
 /// Creates the cameras with what they are trained on, the site of the square, and the sources of phones and ship.
 async fn create(app: &App) -> anyhow::Result<()> {
     let site = SiteId::new(SITE)?;
-    app.create_site(NewSite { display_name: "Square".to_owned(), ..NewSite::named(site.clone()) }).await?;
+    app.sites().create(NewSite { display_name: "Square".to_owned(), ..NewSite::named(site.clone()) }).await?;
     for place in places() {
         let is_square = place.identities == Identities::Phones;
         let seen = training_site(&place);
@@ -84,7 +84,7 @@ async fn create(app: &App) -> anyhow::Result<()> {
                 site: is_square.then(|| site.clone()),
                 ..NewCamera::named(id.clone())
             };
-            app.create_camera(camera).await?;
+            app.cameras().create(camera).await?;
             app.set_picture(&id, Some(&Picture::new(PictureFormat::Png, png_file(&picture)?)?)).await?;
             if place.is_trained {
                 app.store.insert_samples(&id, samples, Durability::Synced).await?;
@@ -126,8 +126,8 @@ async fn train(app: &App) -> anyhow::Result<()> {
     let mut runs = Vec::new();
     for (id, _) in places().iter().filter(|place| place.is_trained).flat_map(|place| place.cameras) {
         let id = CameraId::new(id)?;
-        if app.camera(&id).await?.active_model.is_none() {
-            let run = app.start_run(&id, RunRequest::default(), None).await?.id;
+        if app.cameras().get(&id).await?.active_model.is_none() {
+            let run = app.training().start(&id, RunRequest::default(), None).await?.id;
             runs.push((id, run));
         }
     }
@@ -142,7 +142,7 @@ async fn train(app: &App) -> anyhow::Result<()> {
 
 /// Waits for a training run.
 async fn trained(app: &App, id: &CameraId, run: RunId) -> anyhow::Result<()> {
-    let mut changes = std::pin::pin!(app.watch_run(id, run).await?);
+    let mut changes = std::pin::pin!(app.training().watch(id, run).await?);
     while let Some(run) = changes.next().await {
         let run = run?;
         anyhow::ensure!(

@@ -89,7 +89,7 @@ pub(super) async fn all(app: &App) -> Result<Vec<CollectionId>> {
     let mut collections = vec![CollectionId::Cameras];
     let mut after: Option<CameraId> = None;
     loop {
-        let page = app.cameras(None, after.as_ref(), app.limits.page_items).await?;
+        let page = app.cameras().list(None, after.as_ref(), app.limits.page_items).await?;
         for camera in page.items {
             let id = camera.id();
             collections.extend([CollectionId::Samples(id.clone()), CollectionId::Tracks(id.clone())]);

@@ -146,7 +146,7 @@ class Samples:
         Args:
             camera_id: The camera.
             detections: Boxes as CSV or NDJSON.
-            fixes: Fixes as CSV, NMEA, GPX or reports of gpsd.
+            fixes: Fixes as CSV, NMEA, GPX, FIT, solutions of RTKLIB, a log of GnssLogger or reports of gpsd.
             method: `nearest` by default.
             window_s: Box and fix are at most this far apart (nearest).
             longest_gap_s: Fixes are joined over at most this long a gap (interpolate).

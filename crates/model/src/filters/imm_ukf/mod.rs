@@ -38,7 +38,7 @@ pub struct ImmUkfOptions {
     pub initial_turn_rate_sigma_rad_s: f64,
     /// Mean sojourn time in constant velocity and in coordinated turn, s.
     pub sojourn_s: [f64; 2],
-    /// The filter is reinitialised by the first fix after a gap longer than this, s.
+    /// The filter is restarted by the first fix after a gap longer than this, s.
     pub max_gap_s: f64,
 }
 

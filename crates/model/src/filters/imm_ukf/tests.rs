@@ -126,7 +126,7 @@ fn fix_at(east_m: f64, north_m: f64) -> Option<(EastNorth, f64)> {
 }
 
 #[test]
-fn without_fixes_the_modes_return_to_their_chain_and_a_long_gap_reinitialises() {
+fn without_fixes_the_modes_return_to_their_chain_and_a_long_gap_restarts() {
     let options = ImmUkfOptions { max_gap_s: 60.0, ..ImmUkfOptions::from_acceleration(0.5) };
     let mut filter = ImmUkf::new(options);
     assert_eq!(filter.step(1.0, None), None);

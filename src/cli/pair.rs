@@ -1,5 +1,7 @@
 //! `sightfix pair`
 
+use std::ffi::OsStr;
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -20,8 +22,8 @@ use crate::app::{
 use crate::clock::Clock;
 use crate::config::Limits;
 use crate::domain::{
-    CameraId, ClockOffset, Detection, ImageSize, Receiver, ReceiverId, Receivers, TargetId, TimeBounds,
-    parse_time,
+    CameraId, ClockOffset, Detection, Error, ImageSize, Receiver, ReceiverId, Receivers, TargetId,
+    TimeBounds, parse_time,
 };
 use crate::exchange::{
     self, FixFormat, FrameClock, FrameFileFormat, LaidOut, MatchedSampleWriter, RowError, RowRules,
@@ -41,7 +43,8 @@ pub(super) struct Pair {
     /// .gz or .zst; - is standard input
     #[arg(long, value_name = "FILE")]
     detections: PathBuf,
-    /// Format of boxes by the number of their frame: mot (MOTChallenge) or kitti (tracking labels)
+    /// Format of boxes by the number of their frame: mot (MOTChallenge), kitti (tracking labels), yolo (a folder of a tracker's
+    /// labels per frame), coco (with tracks) or cvat (CVAT for video)
     #[arg(long, value_name = "FORMAT", requires_all = ["frame_rate", "start_time"])]
     detections_format: Option<FrameFileFormat>,
     /// Frames per second of such a file
@@ -116,7 +119,7 @@ struct MatchFlags {
     /// The camera whose active model is used to match
     #[arg(long, value_name = "ID", value_parser = camera_id, requires = "matches")]
     camera: Option<CameraId>,
-    /// Size of the image, to match without a model, and for --box-unit share
+    /// Size of the image, to match without a model, for --box-unit share, and for boxes of yolo
     #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = image_size)]
     image_size: Option<ImageSize>,
     /// Leave out samples whose match is less probable than this
@@ -256,13 +259,17 @@ impl Pair {
     }
 
     fn boxes(&self, rules: RowRules) -> anyhow::Result<Box<dyn Iterator<Item = BoxRow>>> {
-        let input = files::open_input(&self.detections)?;
         if let (Some(format), Some(start), Some(rate)) =
             (self.detections_format, self.start_time, self.frame_rate)
         {
             let clock = FrameClock::new(start, rate).context("--frame-rate")?;
-            return Ok(Box::new(exchange::read_frame_file(input, format, clock, rules)));
+            if format == FrameFileFormat::Yolo && self.detections.is_dir() {
+                return Ok(Box::new(yolo_boxes(&self.detections, clock, rules)?));
+            }
+            let input = files::open_input(&self.detections)?;
+            return Ok(exchange::read_frame_file(input, format, clock, rules));
         }
+        let input = files::open_input(&self.detections)?;
         let format = files::format_of(&self.detections, None)?;
         let laid_out = LaidOut::from((format, &self.layout.to_layout()));
         let boxes = exchange::read_detections(input, laid_out, &rules, self.target_id.clone());
@@ -283,6 +290,40 @@ impl Pair {
         }
         Receivers::new(receivers).context("--receiver")
     }
+}
+
+/// The boxes of a folder with a file of labels per frame, whose names end with its number. The first frame is 1, or 0 if there is
+/// one; a frame without boxes has no file.
+fn yolo_boxes(
+    folder: &Path,
+    clock: FrameClock,
+    rules: RowRules,
+) -> anyhow::Result<impl Iterator<Item = BoxRow> + use<>> {
+    let mut files = Vec::new();
+    for entry in folder.read_dir().with_context(|| format!("cannot read {}", folder.display()))? {
+        let path = entry?.path();
+        let stem =
+            path.file_stem().and_then(OsStr::to_str).filter(|_| path.extension() == Some("txt".as_ref()));
+        if let Some(number) = stem.and_then(exchange::frame_number) {
+            files.push((number, path));
+        }
+    }
+    files.sort();
+    let lowest = files.first().map(|(number, _)| *number);
+    let lowest = lowest.with_context(|| format!("{} has no file such as gate_12.txt", folder.display()))?;
+    let boxes = files.into_iter().map(move |(number, path)| {
+        let file = File::open(&path).map_err(|error| Error::fault(format!("{}: {error}", path.display())))?;
+        let clock = clock.after(number - lowest.min(1))?;
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let rows = exchange::read_frame_file(file, FrameFileFormat::Yolo, clock, rules);
+        Ok(rows.map(move |row| {
+            row.map(|row| row.map_err(|row| RowError { reason: format!("{} ({name})", row.reason), ..row }))
+        }))
+    });
+    Ok(boxes.flat_map(|file: crate::domain::Result<_>| match file {
+        Ok(rows) => Box::new(rows) as Box<dyn Iterator<Item = BoxRow>>,
+        Err(error) => Box::new(std::iter::once(Err(error))),
+    }))
 }
 
 /// The receivers with their estimated offsets, where there is an estimate.

@@ -331,6 +331,32 @@ async fn stored(server: &TestServer) -> Vec<Row> {
     rows(&exported.expect(200).text())
 }
 
+/// A folder of labels per frame, of which the third has no box, as a tracker of Ultralytics leaves it.
+#[test]
+fn labels_of_yolo_are_paired_by_the_number_in_their_names() {
+    let folder = data_folder();
+    let labels = folder.path().join("labels");
+    std::fs::create_dir(&labels).expect("a folder");
+    for (name, lines) in [
+        ("gate_1.txt", "0 0.5 0.5 0.1 0.2 7\n"),
+        ("gate_2.txt", "0 0.25 0.5 0.1 0.2 7\n0 0.5 0.5 0.1 0.2\n"),
+        ("gate_10.txt", "0 0.75 0.5 0.1 0.2 7\n"),
+        ("notes.md", ""),
+    ] {
+        std::fs::write(labels.join(name), lines).expect("a file can be written");
+    }
+    let fixes = folder.path().join("fixes.csv");
+    let times = ["00", "01", "09"].map(|second| format!("2025-06-01T12:00:{second}Z,phone,103.98,30.62"));
+    std::fs::write(&fixes, format!("time,receiver_id,longitude,latitude\n{}\n", times.join("\n")))
+        .expect("written");
+    let flags = ["--detections-format", "yolo", "--frame-rate", "1", "--start-time", "2025-06-01T12:00:00Z"];
+    let flags = [&flags[..], &["--image-size", "1000x500", "--receiver", "phone=7"]].concat();
+    let (printed, rows) = pair(&labels, &fixes, &folder.path().join("out.csv"), &flags);
+    let lefts: Vec<f64> = rows.iter().map(|row| row.numbers[0].round()).collect();
+    assert_eq!(lefts, [450.0, 200.0, 700.0], "{printed}");
+    assert!(printed.contains("rejected rows 1"), "{printed}");
+}
+
 #[tokio::test]
 async fn two_parts_are_paired_by_the_receivers_of_the_profile() {
     let recording = Recording::simulated("3", "1500");

@@ -21,11 +21,11 @@ const MQTT = 'mqtt://broker:1883';
 /** A camera's stream; the other is that of an Axis camera. */
 const RTSP = ['rtsp://camera:554/', 'rtsp://camera/axis-media/media.amp?camera=1&audio=0&video=0&analytics=polygon'];
 
-/** AXIS scene metadata. */
+/** AXIS scene metadata, the topic axis.scene.frame_v1. */
 const AXIS: JsonMapping = {
-  items: '/frame/observations',
-  time: '/frame/timestamp',
-  target: '/track_id',
+  items: '/detections',
+  time: '/timestamp',
+  target: '/object_track_id',
   class: '/class/type',
   score: '/class/score',
   bounding_box: { form: 'corners', unit: 'share', sides: ['/bounding_box/left', '/bounding_box/top', '/bounding_box/right', '/bounding_box/bottom'] },

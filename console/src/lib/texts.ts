@@ -179,7 +179,7 @@ const table = {
   'camera.width': ['Image width, px', 'Bildbreite, px'],
 
   'boxes.axis': ['Axis camera', 'Axis-Kamera'],
-  'boxes.axis.help': ['Scene metadata over MQTT, or posted to the server', 'Szenen-Metadaten über MQTT oder an den Server geschickt'],
+  'boxes.axis.help': ['Scene metadata of AXIS OS 12.8 or newer over MQTT; an older one as an ONVIF camera', 'Szenen-Metadaten ab AXIS OS 12.8 über MQTT; ein älteres als ONVIF-Kamera'],
   'boxes.connect': ['Connect and look at the boxes', 'Verbinden und Boxen ansehen'],
   'boxes.deepstream': ['DeepStream', 'DeepStream'],
   'boxes.deepstream.help': ['Messages of nvmsgbroker over MQTT or Kafka, with a tracker', 'Nachrichten von nvmsgbroker über MQTT oder Kafka, mit Tracker'],

@@ -69,7 +69,7 @@ pub use cursor::{Cursor, read_cursor, write_cursor};
 pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
-pub use frame_files::{FrameClock, FrameFileFormat, read_frame_file};
+pub use frame_files::{FrameClock, FrameFileFormat, frame_number, read_frame_file};
 pub use home_assistant::{home_assistant_attributes, home_assistant_discovery};
 pub use messages::{
     BoxMapping, DetectedBox, JsonMapping, MessageContext, MessageDecoder, MessageFormat, MessageItem,

@@ -133,6 +133,11 @@ impl MessageDecoder for Mapped {
             Some(pointer) => match message.pointer(pointer) {
                 Some(Value::Array(items)) => items,
                 Some(_) => return Err(format!("has at {pointer} no array")),
+                // Axis leaves the array out of a frame in which nothing is seen.
+                None if message.is_object() => {
+                    reading.skip(format!("has nothing at {pointer}"));
+                    return Ok(reading);
+                }
                 None => return Err(format!("has nothing at {pointer}")),
             },
         };

@@ -27,7 +27,8 @@ fn detections(reading: &Reading) -> Vec<&NamedDetection> {
     detections.collect()
 }
 
-/// The example of Axis' Message Broker, topic com.axis.analytics_scene_description.v0.beta, without its images.
+/// The example of Axis' Message Broker before AXIS OS 12.8, topic com.axis.analytics_scene_description.v0.beta, without its
+/// images.
 const AXIS: &str = r#"{"frame": {"timestamp": "2023-03-08T09:00:19.320111Z", "observations": [
     {"track_id": "1", "bounding_box": {"bottom": 0.89332, "left": 0.13332, "right": 0.80004, "top": 0.59942},
      "class": {"type": "Human", "score": 0.6, "upper_clothing_colors": [{"name": "White", "score": 0.78}]}},
@@ -56,6 +57,30 @@ fn frames_of_axis_are_read_by_a_mapping() {
     assert_eq!(seen[1].class.as_ref().map(TargetClass::as_str), Some("Bus"));
     assert_eq!(seen[1].score.map(Score::value), Some(0.7));
     assert_eq!((&seen[2].class, seen[2].score), (&None, None));
+}
+
+/// A frame of axis.scene.frame_v1, by its documentation and by what a camera with AXIS OS 12.11 was seen to send.
+#[test]
+fn frames_of_axis_since_12_8_are_read_by_a_mapping() {
+    let mut mapping = axis();
+    for (field, pointer) in [("items", "/detections"), ("time", "/timestamp"), ("target", "/object_track_id")]
+    {
+        mapping[field] = json!(pointer);
+    }
+    let mapping = json!({"mapping": mapping});
+    let frame = r#"{"channel_id": 1, "timestamp": "2026-05-29T11:55:30.369150Z", "detections": [
+        {"object_track_id": "8e653185-8e54-4dca-8af1-9f7202aca120",
+         "bounding_box": {"left": 0.4499, "top": 0.2365, "right": 0.7473, "bottom": 0.9853},
+         "class": {"type": "Human", "score": 0.7, "upper_clothing_colors": []}}],
+        "track_events": [{"type": "TrackEnded", "object_track_id": "0"}]}"#;
+    let reading = read(&mapping, frame).expect("a frame");
+    let [seen] = detections(&reading)[..] else { panic!("{reading:?}") };
+    assert_eq!(seen.target_id.as_str(), "8e653185-8e54-4dca-8af1-9f7202aca120");
+    assert_eq!(seen.time.to_string(), "2026-05-29T11:55:30.36915Z");
+    assert_eq!(seen.class.as_ref().map(TargetClass::as_str), Some("Human"));
+    let empty =
+        read(&mapping, r#"{"channel_id": 1, "timestamp": "2026-05-29T11:55:32.4Z"}"#).expect("a frame");
+    assert_eq!(empty, Reading { items: Vec::new(), skipped: vec!["has nothing at /detections".to_owned()] });
 }
 
 #[test]

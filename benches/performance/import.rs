@@ -43,7 +43,7 @@ pub(crate) fn run() {
             drop(runtime.block_on(load::one(served.address, &request)));
             let rate = samples.len() as f64 / began.elapsed().as_secs_f64();
             let stored =
-                runtime.block_on(served.app.count_samples(&id, &Default::default())).expect("a count");
+                runtime.block_on(served.app.samples().count(&id, &Default::default())).expect("a count");
             assert_eq!(stored.all as usize, samples.len(), "every row is stored");
             rate
         };

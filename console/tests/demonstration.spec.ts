@@ -3,13 +3,30 @@ import { execFileSync } from 'node:child_process';
 import { mkdtempSync, rmSync, writeFileSync } from 'node:fs';
 import { tmpdir } from 'node:os';
 import { join, resolve } from 'node:path';
+import type { Page } from '@playwright/test';
 import { accessibilityFindings, expect, test } from './fixtures';
 import type { ServerInfo } from '../src/lib/types';
 
 const PICTURES = process.env.CONSOLE_PICTURES ? resolve('../docs/console') : undefined;
-/** Frames of the moving picture, and the time from one to the next. */
-const FRAMES = 40;
-const FRAME_MS = 500;
+/** Length of the moving picture, and least time from one of its frames to the next. */
+const PICTURE_MS = 20_000;
+const FRAME_MS = 250;
+
+/** Writes what the page shows into files that are named by their times, ms. */
+async function recordFrames(page: Page, folder: string): Promise<void> {
+  const session = await page.context().newCDPSession(page);
+  let latest_ms = 0;
+  session.on('Page.screencastFrame', ({ data, sessionId, metadata }) => {
+    void session.send('Page.screencastFrameAck', { sessionId });
+    const time_ms = Math.round(1000 * metadata.timestamp!);
+    if (time_ms - latest_ms < FRAME_MS) return;
+    latest_ms = time_ms;
+    writeFileSync(join(folder, `${time_ms}.png`), Buffer.from(data, 'base64'));
+  });
+  await session.send('Page.startScreencast', { format: 'png' });
+  await page.waitForTimeout(PICTURE_MS);
+  await session.send('Page.stopScreencast');
+}
 
 test.use({ flags: ['--demo'] });
 
@@ -42,12 +59,8 @@ test('the moving picture of the documentation', async ({ console: page, server }
   await page.reload();
   await expect(page.getByRole('button', { name: /^tracker:\d/ }).nth(3)).toBeVisible();
   const folder = mkdtempSync(join(tmpdir(), 'sightfix-frames-'));
-  const started_ms = Date.now();
-  for (let frame = 0; frame < FRAMES; frame++) {
-    await page.waitForTimeout(Math.max(0, started_ms + frame * FRAME_MS - Date.now()));
-    writeFileSync(join(folder, `${String(frame).padStart(3, '0')}.png`), await page.screenshot());
-  }
+  await recordFrames(page, folder);
   // Python with Pillow joins the frames.
-  execFileSync(process.env.PYTHON ?? 'python3', ['tests/moving_picture.py', folder, join(PICTURES!, 'demonstration.webp'), String(FRAME_MS)]);
+  execFileSync(process.env.PYTHON ?? 'python3', ['tests/moving_picture.py', folder, join(PICTURES!, 'demonstration.webp')]);
   rmSync(folder, { recursive: true });
 });

@@ -157,7 +157,7 @@ impl App {
         id: &CameraId,
         samples: Vec<StoredSample>,
     ) -> Result<TrainingRun<CameraId>> {
-        self.store_paired(id, samples, ImportOptions::default()).await?;
+        self.samples().store_paired(id, samples, ImportOptions::default()).await?;
         self.training().start(id, RunRequest::default(), None).await
     }
 

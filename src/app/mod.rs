@@ -73,7 +73,7 @@ pub use paired_import::{PairedImport, PairedReport};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
 pub use retention::{ClockDoubt, Retention, retention_doubt};
-pub use samples::{ImportOptions, ImportReport, RejectedRow};
+pub use samples::{ImportOptions, ImportReport, RejectedRow, Samples};
 pub use sessions::Sessions;
 pub use site_registry::{ActiveSite, SiteRegistry};
 pub use site_training::SiteRunRequest;

@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use tokio_util::sync::CancellationToken;
 
+use super::ImportReport;
 use super::matching::{MatchReport, MatchRequest};
 use super::recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
-use super::samples::{BATCH_ROWS, Import, ImportOptions};
-use super::{App, ImportReport};
+use super::samples::{BATCH_ROWS, Import, ImportOptions, Samples};
 use crate::domain::{
     CameraId, Error, ImageSize, Receiver, ReceiverId, Receivers, Result, StoredSample, TargetId,
 };
@@ -77,7 +77,7 @@ struct Work {
     report: PairedReport,
 }
 
-impl App {
+impl Samples<'_> {
     /// Pairs two files by the receivers of the camera's profile and stores the samples. One bad row
     /// never loses the others.
     ///
@@ -126,7 +126,7 @@ impl App {
         mut samples: Vec<StoredSample>,
         options: ImportOptions,
     ) -> Result<ImportReport> {
-        let mut import = Import::new(self, id, options)?;
+        let mut import = Import::new(*self, id, options)?;
         while !samples.is_empty() {
             let rest = samples.split_off(samples.len().min(BATCH_ROWS));
             let batch = std::mem::replace(&mut samples, rest);

@@ -5,17 +5,21 @@ use std::sync::Arc;
 
 use futures_util::{Stream, StreamExt as _};
 use serde::{Deserialize, Serialize};
-use tokio::sync::mpsc;
+use tokio::sync::{Semaphore, mpsc};
 
-use super::access::Permission;
+use super::access::{Caller, Permission};
 use super::idempotency::{first_answer, record_of, stored_answer};
+use super::registry::{ActiveCamera, Registry};
 use super::swapped_columns::PlaceCheck;
 use super::{App, Page, page_of};
+use crate::clock::Clock;
+use crate::config::Limits;
 use crate::domain::{
     CameraId, Durability, Error, IdempotentRequest, OnConflict, Result, SampleCount, StoredSample,
 };
 use crate::exchange::{self, CsvLayout, Format, RowError, RowRules};
-use crate::store::{Completion, InsertOptions, Inserted, SampleFilter, SampleKey};
+use crate::store::{Completion, InsertOptions, Inserted, SampleFilter, SampleKey, Store};
+use crate::telemetry::Metrics;
 
 /// Rows that go to the store at once.
 pub(super) const BATCH_ROWS: usize = 1_000;
@@ -81,7 +85,43 @@ impl ImportReport {
     }
 }
 
+/// The use cases of samples.
+#[derive(Clone, Copy)]
+pub struct Samples<'a> {
+    pub(super) store: &'a Store,
+    registry: &'a Registry,
+    clock: &'a Clock,
+    pub(super) limits: &'a Limits,
+    pub(super) metrics: &'a Metrics,
+    pub(super) pairings: &'a Arc<Semaphore>,
+    caller: &'a Caller,
+}
+
 impl App {
+    /// The use cases of samples.
+    #[must_use]
+    pub fn samples(&self) -> Samples<'_> {
+        Samples {
+            store: &self.store,
+            registry: &self.registry,
+            clock: &self.clock,
+            limits: &self.limits,
+            metrics: &self.metrics,
+            pairings: &self.pairings,
+            caller: &self.caller,
+        }
+    }
+}
+
+impl Samples<'_> {
+    /// The camera that a caller means.
+    ///
+    /// # Errors
+    /// As [`App::active_camera`].
+    pub(super) async fn active_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
+        self.registry.active_camera(self.store, self.caller, id).await
+    }
+
     /// Stores the rows of a file. One bad row never loses the others; what is counted as accepted
     /// is committed.
     ///
@@ -103,7 +143,7 @@ impl App {
         if let Some(first) = self.repeated_import(&options).await? {
             return Ok(first);
         }
-        let mut import = Import::new(self, id, options)?;
+        let mut import = Import::new(*self, id, options)?;
         let (sender, mut batches) = mpsc::channel(BATCHES_AHEAD);
         let reading =
             tokio::task::spawn_blocking(move || read_batches(file, format, &layout, &rules, &sender));
@@ -132,7 +172,7 @@ impl App {
         self.active_camera(id).await?;
         let mut batches = std::pin::pin!(rows.ready_chunks(BATCH_ROWS));
         if let Some(request) = &options.idempotent
-            && stored_answer(&self.store, &self.clock, request).await?.is_some()
+            && stored_answer(self.store, self.clock, request).await?.is_some()
         {
             // The request is known once all of it has come.
             while let Some(chunk) = batches.next().await {
@@ -142,7 +182,7 @@ impl App {
         if let Some(first) = self.repeated_import(&options).await? {
             return Ok(first);
         }
-        let mut import = Import::new(self, id, options)?;
+        let mut import = Import::new(*self, id, options)?;
         let mut end = Ok(());
         while let Some(chunk) = batches.next().await {
             let mut batch = Vec::with_capacity(chunk.len());
@@ -169,7 +209,7 @@ impl App {
     /// `IdempotencyKeyReused` if that was another one.
     pub(super) async fn repeated_import(&self, options: &ImportOptions) -> Result<Option<ImportReport>> {
         let Some(request) = &options.idempotent else { return Ok(None) };
-        let first = first_answer(&self.store, &self.clock, request).await?;
+        let first = first_answer(self.store, self.clock, request).await?;
         first.map(|report| serde_json::from_str(&report).map_err(Error::fault)).transpose()
     }
 
@@ -185,7 +225,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn samples(
+    pub async fn list(
         &self,
         id: &CameraId,
         filter: &SampleFilter,
@@ -200,7 +240,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn count_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<SampleCount> {
+    pub async fn count(&self, id: &CameraId, filter: &SampleFilter) -> Result<SampleCount> {
         let mut count = SampleCount::default();
         for has_fix in
             [true, false].into_iter().filter(|has_fix| filter.has_fix.is_none_or(|it| it == *has_fix))
@@ -217,7 +257,7 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn delete_samples(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
+    pub async fn delete(&self, id: &CameraId, filter: &SampleFilter) -> Result<u64> {
         self.store.delete_samples(id, filter, self.clock.now()).await
     }
 }
@@ -225,7 +265,7 @@ impl App {
 /// An import under way. If the client may repeat it, the latest batch waits, so that the last one is known when
 /// it is stored: with it goes the answer.
 pub(super) struct Import<'a> {
-    app: &'a App,
+    samples: Samples<'a>,
     id: &'a CameraId,
     options: ImportOptions,
     waiting: Option<Batch>,
@@ -236,13 +276,13 @@ pub(super) struct Import<'a> {
 impl<'a> Import<'a> {
     /// # Errors
     /// `PermissionDenied` for a caller who may not replace samples.
-    pub(super) fn new(app: &'a App, id: &'a CameraId, options: ImportOptions) -> Result<Self> {
+    pub(super) fn new(samples: Samples<'a>, id: &'a CameraId, options: ImportOptions) -> Result<Self> {
         if options.on_conflict == OnConflict::Replace {
             // Replacing loses the stored samples, as deleting does.
-            app.caller().authorize(Permission::Operate)?;
+            samples.caller.authorize(Permission::Operate)?;
         }
         Ok(Self {
-            app,
+            samples,
             id,
             options,
             waiting: None,
@@ -271,11 +311,11 @@ impl<'a> Import<'a> {
         let last = self.waiting.take().unwrap_or_default();
         let stored = self.store(last, end.is_ok()).await;
         let ImportReport { accepted, duplicate, rejected, .. } = self.report;
-        self.app.metrics.imported(accepted, duplicate, rejected);
+        self.samples.metrics.imported(accepted, duplicate, rejected);
         stored?;
         end.map_err(|error| with_stored_rows(error, &self.report))?;
         // The answer that was stored: that of another request with the same key, if it came first.
-        Ok(self.app.repeated_import(&self.options).await?.unwrap_or(self.report))
+        Ok(self.samples.repeated_import(&self.options).await?.unwrap_or(self.report))
     }
 
     async fn store(&mut self, batch: Batch, is_last: bool) -> Result<()> {
@@ -286,7 +326,8 @@ impl<'a> Import<'a> {
                 Err(row) => self.reject(row),
             }
         }
-        self.places.see(self.app, self.id, &samples).await?;
+        let camera = self.samples.active_camera(self.id).await?;
+        self.places.see(self.samples.store, &camera, &samples).await?;
         if is_last {
             self.report.warnings = self.places.warnings();
         }
@@ -299,15 +340,15 @@ impl<'a> Import<'a> {
             return Ok(());
         }
         let ImportOptions { durability, on_conflict, .. } = self.options;
-        let options = InsertOptions { durability, on_conflict, completion, now: self.app.clock.now() };
-        let inserted = self.app.store.insert_samples(self.id, samples, options).await;
+        let options = InsertOptions { durability, on_conflict, completion, now: self.samples.clock.now() };
+        let inserted = self.samples.store.insert_samples(self.id, samples, options).await;
         let inserted = inserted.map_err(|error| with_stored_rows(error, &self.report))?;
         self.report = std::mem::take(&mut self.report).and(&inserted);
         Ok(())
     }
 
     fn reject(&mut self, row: RowError) {
-        self.report.reject(row, self.app.limits.rejected_rows);
+        self.report.reject(row, self.samples.limits.rejected_rows);
     }
 }
 

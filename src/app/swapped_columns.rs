@@ -5,11 +5,11 @@
 //! boxes of swapped positions show the ground as a mirror would ([`is_mirrored`]), which needs nothing to compare with.
 //! A camera whose profile states its location has that to compare with, and fixes of another city are told, too.
 
-use super::App;
-use crate::domain::{CameraId, Result, StoredSample};
+use super::registry::ActiveCamera;
+use crate::domain::{Result, StoredSample};
 use crate::geo::{Position, distance_m};
 use crate::model::{FootPosition, is_mirrored, median_position};
-use crate::store::SampleFilter;
+use crate::store::{SampleFilter, Store};
 
 /// Stored samples that tell where the camera's positions are.
 const STORED_SAMPLES: u32 = 50;
@@ -35,7 +35,7 @@ pub(super) struct PlaceCheck {
     stride: u64,
 }
 
-/// What fixes are compared with.
+/// The position that fixes are compared with.
 #[derive(Clone, Copy)]
 struct Reference {
     place: Position,
@@ -44,11 +44,16 @@ struct Reference {
 }
 
 impl PlaceCheck {
-    /// Looks at a batch.
+    /// Looks at a batch of a camera.
     ///
     /// # Errors
     /// A fault if the camera's samples cannot be read.
-    pub(super) async fn see(&mut self, app: &App, id: &CameraId, batch: &[StoredSample]) -> Result<()> {
+    pub(super) async fn see(
+        &mut self,
+        store: &Store,
+        camera: &ActiveCamera,
+        batch: &[StoredSample],
+    ) -> Result<()> {
         let fixes = || {
             let fix = |it: &StoredSample| Some((it.bounding_box.foot_px(), it.fix.as_ref()?.position));
             batch.iter().filter_map(fix)
@@ -58,7 +63,7 @@ impl PlaceCheck {
                 let place = median_position(fixes().map(|(_, position)| position))?;
                 Some(Reference { place, is_location: false })
             };
-            self.reference = known_place(app, id).await?.or_else(of_fixes);
+            self.reference = known_place(store, camera).await?.or_else(of_fixes);
         }
         for fix in fixes() {
             self.look_at(fix);
@@ -131,19 +136,18 @@ impl PlaceCheck {
 }
 
 /// Where a camera is by its profile, else where its positions are by its model, else by some of its samples.
-async fn known_place(app: &App, id: &CameraId) -> Result<Option<Reference>> {
-    if let Some(place) = app.store.camera(id).await?.profile.location {
+async fn known_place(store: &Store, camera: &ActiveCamera) -> Result<Option<Reference>> {
+    if let Some(place) = store.camera(&camera.id).await?.profile.location {
         return Ok(Some(Reference { place, is_location: true }));
     }
-    Ok(place_of_positions(app, id).await?.map(|place| Reference { place, is_location: false }))
+    Ok(place_of_positions(store, camera).await?.map(|place| Reference { place, is_location: false }))
 }
 
-async fn place_of_positions(app: &App, id: &CameraId) -> Result<Option<Position>> {
-    let active = app.active_camera(id).await?;
-    if let Some((model, _)) = active.model() {
+async fn place_of_positions(store: &Store, camera: &ActiveCamera) -> Result<Option<Position>> {
+    if let Some((model, _)) = camera.model() {
         return Ok(Some(model.plane().origin()));
     }
     let filter = SampleFilter { has_fix: Some(true), ..SampleFilter::default() };
-    let samples = app.store.samples(id, &filter, None, STORED_SAMPLES).await?;
+    let samples = store.samples(&camera.id, &filter, None, STORED_SAMPLES).await?;
     Ok(median_position(samples.iter().filter_map(|sample| Some(sample.fix.as_ref()?.position))))
 }

@@ -83,7 +83,7 @@ impl Import {
             let layout = CsvLayout { target_id: self.target_id.clone(), ..self.layout.to_layout() };
             let on_conflict = if self.replace { OnConflict::Replace } else { OnConflict::Keep };
             let options = ImportOptions { on_conflict, ..ImportOptions::default() };
-            let report = app.import_file(&self.camera, source, (format, layout), options).await;
+            let report = app.samples().import_file(&self.camera, source, (format, layout), options).await;
             app.store.close().await;
             anyhow::Ok(report?)
         })?;

@@ -86,7 +86,7 @@ pub(super) async fn pair(
     let receiver_id = opening.receiver_id.as_deref().map(ReceiverId::new).transpose()?;
     let (detections_format, fixes_format) =
         (detection_format(opening.detections_format)?, fix_format(opening.fixes_format)?);
-    app.row_rules(&camera).await?; // refuses an unknown camera before its samples are sent
+    app.samples().row_rules(&camera).await?; // refuses an unknown camera before its samples are sent
     let [mut detections, mut fixes] = pieces.spool(app).await?;
     if let Some(request) = &idempotent {
         request.hasher.update(&prost::Message::encode_to_vec(&opening));
@@ -107,7 +107,7 @@ pub(super) async fn pair(
         estimates_offsets,
         matching,
     };
-    Ok(response(app.import_paired(&camera, import).await?, durability))
+    Ok(response(app.samples().import_paired(&camera, import).await?, durability))
 }
 
 fn detection_format(format: i32) -> Result<Format> {

@@ -53,11 +53,11 @@ impl SampleService for Samples {
                 request.hasher.update(on_conflict.to_string().as_bytes());
             }
             batches.camera = first.camera_id;
-            let rules = app.row_rules(&camera).await?;
+            let rules = app.samples().row_rules(&camera).await?;
             let hasher = idempotent.as_ref().map(|request| request.hasher.clone());
             let rows = rows(first.samples, batches, rules, hasher);
             let options = ImportOptions { durability, on_conflict, idempotent };
-            let report = app.import_rows(&camera, rows, options).await?;
+            let report = app.samples().import_rows(&camera, rows, options).await?;
             Ok(imported(report, durability))
         })
         .await
@@ -85,7 +85,7 @@ impl SampleService for Samples {
             let filter = sample_filter(asked.filter)?;
             let size = pages::size(asked.page_size, &app.limits)?;
             let after = pages::cursor::<SampleKey>(&asked.page_token)?;
-            let page = app.samples(&camera, &filter, after, size).await?;
+            let page = app.samples().list(&camera, &filter, after, size).await?;
             Ok(proto::ListSamplesResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 samples: page.items.into_iter().map(Into::into).collect(),
@@ -100,7 +100,7 @@ impl SampleService for Samples {
     ) -> Reply<proto::CountSamplesResponse> {
         answer(&self.app, request, |app, asked| async move {
             let filter = sample_filter(asked.filter)?;
-            let count = app.count_samples(&camera_id(&asked.camera_id)?, &filter).await?;
+            let count = app.samples().count(&camera_id(&asked.camera_id)?, &filter).await?;
             let SampleCount { all, without_fix } = count;
             Ok(proto::CountSamplesResponse { count: all, without_fix })
         })
@@ -120,7 +120,7 @@ impl SampleService for Samples {
                     "must have from, until, target_id or has_fix, so that not all samples go by an oversight",
                 ));
             }
-            let deleted = app.delete_samples(&camera, &filter).await?;
+            let deleted = app.samples().delete(&camera, &filter).await?;
             Ok(proto::DeleteSamplesResponse { deleted })
         })
         .await

@@ -248,7 +248,7 @@ async fn load_samples(app: &App, camera: &CameraId, filter: &SampleFilter, most:
     let mut samples = Vec::new();
     let mut after = None;
     loop {
-        let page = app.samples(camera, &filter, after, PAGE_SAMPLES).await?;
+        let page = app.samples().list(camera, &filter, after, PAGE_SAMPLES).await?;
         samples.extend(page.items.into_iter().filter_map(StoredSample::with_fix));
         if samples.len() > 2 * most {
             samples.drain(..samples.len() - most);

@@ -56,7 +56,10 @@ impl PinholeCamera {
         let right = (column_px - 0.5 * width_px) / self.focal_px;
         let below = (row_px - 0.5 * height_px) / self.focal_px;
         let (ahead, down) = (cos_tilt - below * sin_tilt, sin_tilt + below * cos_tilt);
-        let distance = (down > 0.0).then(|| self.height_m / down)?;
+        if down <= 0.0 {
+            return None;
+        }
+        let distance = self.height_m / down;
         let (ahead_m, right_m) = (distance * ahead, distance * right);
         Some(EastNorth {
             east_m: sin_pan * ahead_m + cos_pan * right_m,

@@ -70,7 +70,7 @@ async fn estimate_gnss_error(
     request: Request,
 ) -> ApiResult<Response> {
     let (parts, content) = request.into_parts();
-    let time_bounds = app.row_rules(&id).await?.time_bounds;
+    let time_bounds = app.samples().row_rules(&id).await?.time_bounds;
     let limits = &app.limits;
     let source = match media_type(&parts.headers) {
         Some("application/json") => {

@@ -258,7 +258,7 @@ async fn pair_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, req
     let matching = matching(&mut params, &app)?;
     params.end()?;
     let idempotent = idempotent(&head)?;
-    app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
+    app.samples().row_rules(&id).await?; // refuses an unknown camera before its samples are sent
     let names = [Part::Detections, Part::Fixes].map(Part::as_str);
     let [mut detections, mut fixes] = parts(&app, &head, content, names).await?;
     if let Some(request) = &idempotent {
@@ -292,7 +292,7 @@ async fn pair_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, req
         estimates_offsets,
         matching,
     };
-    let report = app.import_paired(&id, import).await?;
+    let report = app.samples().import_paired(&id, import).await?;
     Ok(json(&paired_samples(report, durability, estimates_offsets))?)
 }
 

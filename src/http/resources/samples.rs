@@ -173,13 +173,13 @@ async fn import_samples(
     let format = import_format(&parts.headers)?;
     layout_of(format, &layout)?;
     let idempotent = idempotent(&parts)?;
-    app.row_rules(&id).await?; // refuses an unknown camera before its samples are sent
+    app.samples().row_rules(&id).await?; // refuses an unknown camera before its samples are sent
     let mut spooled = body::spooled(&app, &parts, content).await?;
     if let Some(request) = &idempotent {
         spooled = spooled.hash_into(request).await?;
     }
     let options = ImportOptions { durability, on_conflict, idempotent };
-    let report = app.import_file(&id, spooled, (format, layout), options).await?;
+    let report = app.samples().import_file(&id, spooled, (format, layout), options).await?;
     Ok(json(&Imported::new(report, durability))?)
 }
 
@@ -244,7 +244,7 @@ async fn page(
     after: Option<SampleKey>,
     limit: u32,
 ) -> Result<Response> {
-    let page = app.samples(id, filter, after, limit).await?;
+    let page = app.samples().list(id, filter, after, limit).await?;
     let next_cursor = page.next.as_ref().map(write_cursor);
     json(&SamplePage { items: page.items.iter().map(wire::Sample::from).collect(), next_cursor })
 }
@@ -269,7 +269,7 @@ impl Export {
             let last = self.writer.finish().map_err(Error::fault)?;
             return Ok((last.into(), None));
         };
-        let page = self.app.samples(&self.id, &self.filter, Some(next), EXPORT_PAGE).await?;
+        let page = self.app.samples().list(&self.id, &self.filter, Some(next), EXPORT_PAGE).await?;
         (self.page, self.next) = (page.items, page.next);
         let written = std::mem::take(self.writer.get_mut());
         Ok((written.into(), Some(self)))
@@ -279,7 +279,7 @@ impl Export {
 /// All samples, page by page as the client reads them.
 async fn export(app: App, id: CameraId, filter: SampleFilter, format: Format) -> Result<Response> {
     // The first page is read before the answer begins, so that an unknown camera is still refused.
-    let first = app.samples(&id, &filter, None, EXPORT_PAGE).await?;
+    let first = app.samples().list(&id, &filter, None, EXPORT_PAGE).await?;
     let ending = match format {
         Format::Csv => "csv",
         Format::Ndjson => "ndjson",
@@ -318,7 +318,7 @@ async fn export(app: App, id: CameraId, filter: SampleFilter, format: Format) ->
 )]
 async fn count_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
     let filter = only_filter(&uri)?;
-    let domain::SampleCount { all, without_fix } = app.count_samples(&id, &filter).await?;
+    let domain::SampleCount { all, without_fix } = app.samples().count(&id, &filter).await?;
     Ok(json(&SampleCount { count: all, without_fix })?)
 }
 
@@ -345,7 +345,7 @@ async fn delete_samples(CallerApp(app): CallerApp, CameraPath(id): CameraPath, u
         )
         .into());
     }
-    Ok(json(&DeletedSamples { deleted: app.delete_samples(&id, &filter).await? })?)
+    Ok(json(&DeletedSamples { deleted: app.samples().delete(&id, &filter).await? })?)
 }
 
 /// The filter of a query that has no other parameters.

@@ -77,6 +77,8 @@ pub(super) fn yard() -> Place {
             walkers: 6,
             vehicles: 0,
             receiver_share: 0.67,
+            // As of receivers with two frequencies: the alarm must come long before the next knock.
+            gnss_sigma_m: 1.2,
             pan_deg_from: Some((f64::from(PERIOD_S) / 2.0, 20.0)),
             ..options(2, 180.0)
         },

@@ -101,7 +101,7 @@ pub(super) async fn one(app: &App, collection: &CollectionId, id: &str) -> Resul
                 target_id: Some(key.target_id.clone()),
                 ..SampleFilter::default()
             };
-            let found = app.samples(camera, &filter, None, 1).await?.items.into_iter().next();
+            let found = app.samples().list(camera, &filter, None, 1).await?.items.into_iter().next();
             found.filter(|sample| SampleKey::of(sample) == key).map(sample_feature).ok_or_else(unknown)?
         }
         CollectionId::Tracks(camera) => {
@@ -138,7 +138,7 @@ async fn samples(
         let wanted = selection.limit - features.len() as u32;
         // With an area most samples may be elsewhere, so more are read at once than are wanted.
         let read = if selection.area.is_some() { app.limits.page_items } else { wanted };
-        let page = app.samples(camera, &filter, after, read).await?;
+        let page = app.samples().list(camera, &filter, after, read).await?;
         scanned += page.items.len();
         let mut full_at = None;
         for sample in page.items {

@@ -2,6 +2,7 @@
 
 use std::io::{self, BufRead, BufReader, Read};
 
+use quick_xml::escape::unescape;
 use quick_xml::events::BytesStart;
 
 use super::MAX_ROW_BYTES;
@@ -66,9 +67,14 @@ pub(crate) trait Element {
 
 impl Element for BytesStart<'_> {
     fn attribute(&self, name: &str) -> Result<Option<String>, String> {
-        let found = self.try_get_attribute(name).map_err(|error| format!("is not XML: {error}"))?;
-        Ok(found.map(|attribute| attribute.value.into_owned()))
+        let Some(found) = self.try_get_attribute(name).map_err(not_xml)? else { return Ok(None) };
+        Ok(Some(unescape(&found.value).map_err(not_xml)?.into_owned()))
     }
+}
+
+/// Why a document cannot be read.
+pub(crate) fn not_xml(error: impl std::fmt::Display) -> String {
+    format!("is not XML: {error}")
 }
 
 /// Attributes that are finite numbers.

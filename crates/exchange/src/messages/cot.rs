@@ -10,7 +10,7 @@ use quick_xml::events::{BytesStart, Event};
 use super::{MessageContext, MessageDecoder, MessageItem, Reading, ReportedFix};
 use crate::domain::parse_time;
 use crate::fix_quality::sigma_of_deviations;
-use crate::xml::{Element as _, numbers};
+use crate::xml::{Element as _, not_xml, numbers};
 
 pub(super) struct Cot;
 
@@ -76,7 +76,7 @@ impl MessageDecoder for Cot {
         let mut head = None;
         loop {
             buffer.clear();
-            match xml.read_event_into(&mut buffer).map_err(|error| format!("is not XML: {error}"))? {
+            match xml.read_event_into(&mut buffer).map_err(not_xml)? {
                 Event::Eof => return Ok(reading),
                 Event::Start(element) | Event::Empty(element) => match element.local_name().as_ref() {
                     "event" => head = Some(Head::of(&element)?),

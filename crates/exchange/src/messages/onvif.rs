@@ -16,7 +16,7 @@ use super::{
     DetectedBox, MessageContext, MessageDecoder, MessageItem, NamedDetection, Reading, class, parse, score,
 };
 use crate::domain::{TargetId, parse_time};
-use crate::xml::{Element, numbers};
+use crate::xml::{Element, not_xml, numbers};
 
 pub(super) struct Onvif;
 
@@ -96,7 +96,7 @@ impl Frames {
         let mut buffer = Vec::new();
         loop {
             buffer.clear();
-            match xml.read_event_into(&mut buffer).map_err(|error| format!("is not XML: {error}"))? {
+            match xml.read_event_into(&mut buffer).map_err(not_xml)? {
                 Event::Eof => return Ok(()),
                 Event::Start(element) => self.open(element.local_name().as_ref(), &element)?,
                 Event::Empty(element) => {

@@ -37,7 +37,7 @@ impl SnapshotTimes {
 /// # Errors
 /// `InvalidArgument` naming `snapshot.url`.
 pub(super) fn check_snapshot(profile: &NewCamera) -> Result<()> {
-    let address = profile.snapshot.as_ref().map(|source| Address::of_http(source.url()));
+    let address = profile.snapshot.as_ref().map(|source| Address::of_http(&source.http_url()));
     address.transpose().map(drop).map_err(|error| error.at("snapshot.url"))
 }
 

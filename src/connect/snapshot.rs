@@ -1,12 +1,12 @@
 //! Still pictures from the snapshot addresses of cameras.
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
-use http_body_util::{BodyExt as _, Empty, Limited};
-use hyper::Request;
+use http_auth::{PasswordClient, PasswordParams};
+use http_body_util::{BodyExt as _, Full, Limited};
+use hyper::body::Incoming;
 use hyper::client::conn::http1;
-use hyper::header::{ACCEPT, AUTHORIZATION, HOST, HeaderValue, USER_AGENT};
+use hyper::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT, WWW_AUTHENTICATE};
+use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::TokioIo;
 use tokio_util::task::AbortOnDropHandle;
 
@@ -14,7 +14,10 @@ use super::credentials::{Credentials, PeerError};
 use super::peer::{OPEN_TIME, connect, within};
 use crate::app::App;
 use crate::domain::{CameraId, Error, ErrorKind, Picture, PictureFormat, Result, SnapshotSource};
-use crate::exchange::{Address, Scheme, Secrets, bracketed};
+use crate::exchange::{Address, OnvifRequest, SOAP, Scheme, Secrets, bracketed};
+
+/// Largest document of an ONVIF device, bytes.
+const DOCUMENT_BYTES: usize = 1024 * 1024;
 
 /// Fetches a picture from the snapshot address of a camera, stores it, and gives it back. Redirects are not followed.
 ///
@@ -31,39 +34,108 @@ pub async fn fetch_snapshot(app: &App, id: &CameraId) -> Result<Picture> {
 }
 
 async fn fetch(source: &SnapshotSource, most_bytes: usize) -> Result<Picture, PeerError> {
-    let address = Address::of_http(source.url())?;
-    let secrets = Secrets::default();
-    let credentials =
-        Credentials { username: None, sasl_mechanism: None, ca_certificate: None, secrets: &secrets };
-    let stream = connect(&address, address.scheme == Scheme::Https, &credentials).await?;
-    let broken = |error: hyper::Error| PeerError(error.to_string());
-    let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await.map_err(broken)?;
-    let _connection = AbortOnDropHandle::new(tokio::spawn(async move { drop(connection.await) }));
-    let answer = sender.send_request(request(source, &address)?).await.map_err(broken)?;
-    let status = answer.status();
-    if !status.is_success() {
-        return Err(PeerError(format!("the address answered {status}")));
+    let mut camera = Camera { address: Address::of_http(&source.http_url())?, source, challenge: None };
+    if source.is_onvif() {
+        camera.find_snapshot().await?;
     }
-    let body = Limited::new(answer.into_body(), most_bytes).collect().await;
-    let too_large = |error| {
-        PeerError(format!("the picture cannot be read, or has more than {most_bytes} bytes: {error}"))
-    };
-    let content = body.map_err(too_large)?.to_bytes();
+    let content = camera.ask(Method::GET, String::new(), most_bytes).await?;
     let format = PictureFormat::of_file(&content)?;
     Ok(Picture::new(format, content.into())?)
 }
 
-fn request(source: &SnapshotSource, address: &Address) -> Result<Request<Empty<Bytes>>, PeerError> {
-    let mut request = Request::get(&address.path)
-        .header(HOST, format!("{}:{}", bracketed(&address.host), address.port))
-        .header(ACCEPT, "image/jpeg, image/png")
-        .header(USER_AGENT, concat!("sightfix/", env!("CARGO_PKG_VERSION")));
-    if let Some(username) = source.username() {
-        let plain = format!("{username}:{}", source.password().unwrap_or_default());
-        let basic = HeaderValue::from_str(&format!("Basic {}", STANDARD.encode(plain)));
-        let mut basic = basic.map_err(|error| PeerError(error.to_string()))?;
-        basic.set_sensitive(true);
-        request = request.header(AUTHORIZATION, basic);
+/// The peer of a snapshot address.
+struct Camera<'a> {
+    /// Where it is asked next.
+    address: Address,
+    source: &'a SnapshotSource,
+    /// How it wants the user to prove the password.
+    challenge: Option<PasswordClient>,
+}
+
+impl Camera<'_> {
+    /// Asks the ONVIF device service at the address for that of the still picture.
+    async fn find_snapshot(&mut self) -> Result<(), PeerError> {
+        self.address.path = self.ask_device(&OnvifRequest::MediaService).await?;
+        let profile = self.ask_device(&OnvifRequest::Profile).await?;
+        self.address.path = self.ask_device(&OnvifRequest::SnapshotUri(profile)).await?;
+        Ok(())
     }
-    request.body(Empty::new()).map_err(|error| PeerError(error.to_string()))
+
+    async fn ask_device(&mut self, request: &OnvifRequest) -> Result<String, PeerError> {
+        let answer = self.ask(Method::POST, request.document(), DOCUMENT_BYTES).await?;
+        request.answer(&String::from_utf8_lossy(&answer)).map_err(PeerError)
+    }
+
+    /// Sends a request and reads the body of its answer, signed in where the camera asks for it.
+    async fn ask(&mut self, method: Method, body: String, most_bytes: usize) -> Result<Bytes, PeerError> {
+        for is_second in [false, true] {
+            let request = self.request(&method, body.clone())?;
+            let (answer, _connection) = self.send(request).await?;
+            match answer.status() {
+                status if status.is_success() => return read(answer.into_body(), most_bytes).await,
+                StatusCode::UNAUTHORIZED if !is_second => self.take_challenge(&answer)?,
+                StatusCode::UNAUTHORIZED => break,
+                status => return Err(PeerError(format!("the address answered {status}"))),
+            }
+        }
+        Err("the address refuses the username or the password".into())
+    }
+
+    /// Sends a request by a connection of its own, which lasts as long as the second value.
+    async fn send(
+        &self,
+        request: Request<Full<Bytes>>,
+    ) -> Result<(Response<Incoming>, AbortOnDropHandle<()>), PeerError> {
+        let secrets = Secrets::default();
+        let credentials =
+            Credentials { username: None, sasl_mechanism: None, ca_certificate: None, secrets: &secrets };
+        let stream = connect(&self.address, self.address.scheme == Scheme::Https, &credentials).await?;
+        let broken = |error: hyper::Error| PeerError(error.to_string());
+        let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await.map_err(broken)?;
+        let connection = AbortOnDropHandle::new(tokio::spawn(async move { drop(connection.await) }));
+        Ok((sender.send_request(request).await.map_err(broken)?, connection))
+    }
+
+    fn request(&mut self, method: &Method, body: String) -> Result<Request<Full<Bytes>>, PeerError> {
+        let Address { host, port, path, .. } = &self.address;
+        let mut request = Request::builder()
+            .method(method)
+            .uri(path)
+            .header(HOST, format!("{}:{port}", bracketed(host)))
+            .header(USER_AGENT, concat!("sightfix/", env!("CARGO_PKG_VERSION")));
+        request = match *method {
+            Method::GET => request.header(ACCEPT, "image/jpeg, image/png"),
+            _ => request.header(CONTENT_TYPE, SOAP),
+        };
+        let body = Bytes::from(body);
+        if let (Some(username), Some(challenge)) = (self.source.username(), &mut self.challenge) {
+            let password = self.source.password().unwrap_or_default();
+            let (uri, method, body) = (path.as_str(), method.as_str(), Some(&body[..]));
+            let proof = challenge.respond(&PasswordParams { username, password, uri, method, body });
+            let proof = proof.map_err(|error| PeerError(format!("cannot sign in: {error}")))?;
+            let mut proof = HeaderValue::from_str(&proof).map_err(|error| PeerError(error.to_string()))?;
+            proof.set_sensitive(true);
+            request = request.header(AUTHORIZATION, proof);
+        }
+        request.body(Full::new(body)).map_err(|error| PeerError(error.to_string()))
+    }
+
+    fn take_challenge(&mut self, refusal: &Response<Incoming>) -> Result<(), PeerError> {
+        if self.source.username().is_none() {
+            return Err("the address asks for a user; give snapshot.username and snapshot.password".into());
+        }
+        let challenges = refusal.headers().get_all(WWW_AUTHENTICATE).iter();
+        let challenges: Vec<_> = challenges.filter_map(|challenge| challenge.to_str().ok()).collect();
+        let challenge = PasswordClient::try_from(challenges.join(", ").as_str());
+        self.challenge = Some(challenge.map_err(|error| PeerError(format!("cannot sign in: {error}")))?);
+        Ok(())
+    }
+}
+
+async fn read(body: Incoming, most_bytes: usize) -> Result<Bytes, PeerError> {
+    let read = Limited::new(body, most_bytes).collect().await;
+    let read = read.map_err(|error| {
+        PeerError(format!("the answer cannot be read, or has more than {most_bytes} bytes: {error}"))
+    })?;
+    Ok(read.to_bytes())
 }

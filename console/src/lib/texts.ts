@@ -584,7 +584,7 @@ const table = {
   'profile.snapshot': ['Still picture from the camera', 'Standbild der Kamera'],
   'profile.snapshot.kept': ['stays as it is', 'bleibt, wie es ist'],
   'profile.snapshot.password': ['Password', 'Passwort'],
-  'profile.snapshot.url': ['Address (HTTP), which the server asks', 'Adresse (HTTP), die der Server abfragt'],
+  'profile.snapshot.url': ['Address (http:, https: or onvif:), which the server asks', 'Adresse (http:, https: oder onvif:), die der Server abfragt'],
   'profile.snapshot.username': ['User name', 'Benutzername'],
   'profile.saved': ['Saved', 'Gespeichert'],
 

@@ -46,6 +46,7 @@ mod lines;
 mod messages;
 mod nmea_fixes;
 mod objects_only;
+mod onvif_device;
 mod outgoing;
 mod recording;
 mod rows;
@@ -75,6 +76,7 @@ pub use messages::{
     BoxMapping, DetectedBox, JsonMapping, MessageContext, MessageDecoder, MessageFormat, MessageItem,
     NamedDetection, Reading, decoder,
 };
+pub use onvif_device::{OnvifRequest, SOAP};
 pub use outgoing::{OutgoingPosition, cot_event, onvif_frame, position_json};
 pub use recording::{read_recording, write_recording};
 pub use rows::{

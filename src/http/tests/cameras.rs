@@ -219,21 +219,39 @@ async fn a_receivers_error_is_told_from_fixes_at_one_point() {
     assert_eq!(nmea.problem(422, "invalid-argument"), ["fixes"]);
 }
 
-/// Answers one request with a file, after checking that it has the header; its address.
-async fn one_answer(expected: &'static str, file: Vec<u8>) -> String {
+/// Answers requests in turn, each with its head and body if the request has its text, else with 400; the address.
+async fn answering(turns: Vec<(&'static str, &'static str, Vec<u8>)>) -> String {
     use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let address = listener.local_addr().expect("an address");
     tokio::spawn(async move {
-        let (mut stream, _) = listener.accept().await.expect("a client");
-        let mut request = vec![0; 4_096];
-        let length = stream.read(&mut request).await.expect("a request");
-        let request = String::from_utf8_lossy(&request[..length]).into_owned();
-        let status = if request.contains(expected) { "200 OK" } else { "401 Unauthorized" };
-        let head = format!("HTTP/1.1 {status}\r\ncontent-length: {}\r\n\r\n", file.len());
-        stream.write_all(&[head.as_bytes(), &file].concat()).await.expect("an answer");
+        for (expected, head, body) in turns {
+            let (mut stream, _) = listener.accept().await.expect("a client");
+            let mut request = vec![0; 4_096];
+            let length = stream.read(&mut request).await.expect("a request");
+            let request = String::from_utf8_lossy(&request[..length]).into_owned();
+            let head = if request.contains(expected) { head } else { "400 Bad Request" };
+            let head = format!("HTTP/1.1 {head}\r\ncontent-length: {}\r\n\r\n", body.len());
+            stream.write_all(&[head.as_bytes(), &body].concat()).await.expect("an answer");
+        }
     });
-    format!("http://{address}/still.jpg?size=full")
+    address.to_string()
+}
+
+const ASKS_FOR_BASIC: &str = "401 Unauthorized\r\nwww-authenticate: Basic realm=\"Camera 7\"";
+const ASKS_FOR_DIGEST: &str =
+    "401 Unauthorized\r\nwww-authenticate: Digest realm=\"Camera 7\", nonce=\"dcd98b7102dd2f0e\"";
+
+/// Asks a camera with this snapshot address for a picture.
+async fn fetched(snapshot: Value) -> Answer {
+    let rest = Rest::with_camera().await;
+    let headers = [("content-type", "application/merge-patch+json"), ("if-match", "*")];
+    let change = json!({"snapshot": snapshot}).to_string();
+    rest.send("PATCH", "/v1/cameras/c", &headers, change).await.expect(200);
+    let fetched = rest.send("POST", "/v1/cameras/c/picture", &[], Body::empty()).await;
+    let stored = rest.get("/v1/cameras/c/picture").await;
+    assert_eq!(stored.body.is_empty(), fetched.status != StatusCode::OK, "what is fetched is stored");
+    fetched
 }
 
 #[tokio::test]
@@ -252,7 +270,8 @@ async fn a_picture_is_fetched_with_a_password_that_nobody_sees() {
 
     let jpeg = [b"\xff\xd8\xff".as_slice(), &[7; 1_000]].concat();
     // viewer:s3cret
-    let url = one_answer("Basic dmlld2VyOnMzY3JldA==", jpeg.clone()).await;
+    let turns = vec![("GET", ASKS_FOR_BASIC, vec![]), ("Basic dmlld2VyOnMzY3JldA==", "200 OK", jpeg.clone())];
+    let url = format!("http://{}/still.jpg?size=full", answering(turns).await);
     patch(json!({"url": url, "username": "viewer", "password": "s3cret"})).await.expect(200);
     // Written back as it was read, the password stays.
     let shown = rest.get(profile).await.expect(200).json()["snapshot"].clone();
@@ -270,18 +289,39 @@ async fn a_picture_is_fetched_with_a_password_that_nobody_sees() {
 async fn what_is_no_picture_or_too_large_is_not_taken() {
     let most = crate::config::Limits::default().picture_bytes;
     let too_large = [b"\xff\xd8\xff".as_slice(), &vec![0; most]].concat();
-    for (expected, file) in
-        [("GET", b"<html>".to_vec()), ("GET", too_large), ("Basic", b"\xff\xd8\xff".to_vec())]
-    {
-        let rest = Rest::with_camera().await;
-        let headers = [("content-type", "application/merge-patch+json"), ("if-match", "*")];
-        let change = json!({"snapshot": {"url": one_answer(expected, file).await}}).to_string();
-        rest.send("PATCH", "/v1/cameras/c", &headers, change).await.expect(200);
-        rest.send("POST", "/v1/cameras/c/picture", &[], Body::empty())
-            .await
-            .problem(502, "snapshot-unavailable");
-        rest.get("/v1/cameras/c/picture").await.expect(204);
+    for (head, file) in [("200 OK", b"<html>".to_vec()), ("200 OK", too_large), (ASKS_FOR_BASIC, vec![])] {
+        let url = format!("http://{}/", answering(vec![("GET", head, file)]).await);
+        fetched(json!({"url": url})).await.problem(502, "snapshot-unavailable");
     }
+}
+
+/// The proofs are MD5(HA1:nonce:HA2) of RFC 2617 without `qop`, by another program.
+#[tokio::test]
+async fn an_onvif_camera_says_where_its_pictures_are_and_gets_a_digest() {
+    let jpeg = b"\xff\xd8\xff still".to_vec();
+    let xml = |content: &str| format!("<Envelope><Body>{content}</Body></Envelope>").into_bytes();
+    // The camera knows itself by an address that its clients cannot reach.
+    let media = xml("<Media><XAddr>http://10.9.8.7:81/onvif/media</XAddr></Media>");
+    let profiles = xml("<Profiles token=\"main\"><Name>main</Name></Profiles>");
+    let still = xml("<MediaUri><Uri>http://10.9.8.7:81/still.jpg?channel=1</Uri></MediaUri>");
+    let turns = vec![
+        ("GetCapabilities", ASKS_FOR_DIGEST, vec![]),
+        ("response=\"c13a8849539a7a6b8e13c95387076b3f\"", "200 OK", media),
+        ("POST /onvif/media ", "200 OK", profiles),
+        ("<ProfileToken>main</ProfileToken>", "200 OK", still),
+        ("response=\"670f1c01d5d2beee03f2a9d236c465f0\"", "200 OK", jpeg.clone()),
+    ];
+    let url = format!("onvif://{}", answering(turns).await);
+    let snapshot = json!({"url": url, "username": "viewer", "password": "s3cret"});
+    assert_eq!(fetched(snapshot).await.expect(200).body[..], jpeg[..]);
+}
+
+#[tokio::test]
+async fn a_wrong_password_of_a_snapshot_is_refused_and_not_tried_again() {
+    let turns = vec![("GET", ASKS_FOR_DIGEST, vec![]), ("Digest", ASKS_FOR_DIGEST, vec![])];
+    let url = format!("http://{}/still.jpg", answering(turns).await);
+    let snapshot = json!({"url": url, "username": "viewer", "password": "guess"});
+    fetched(snapshot).await.problem(502, "snapshot-unavailable");
 }
 
 #[tokio::test]

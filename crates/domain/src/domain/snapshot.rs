@@ -1,5 +1,6 @@
 //! Where a still picture of what a camera sees is fetched.
 
+use std::borrow::Cow;
 use std::fmt;
 
 use super::error::{Error, Result};
@@ -9,8 +10,13 @@ use super::names::check_text;
 const MAX_URL_BYTES: usize = 512;
 const MAX_CREDENTIAL_BYTES: usize = 256;
 
-/// The address that answers with a still picture, such as ONVIF's snapshot URI or Frigate's
-/// `/api/<camera>/latest.jpg`. The password is never shown.
+/// Begins the address of an ONVIF device.
+const ONVIF: &str = "onvif://";
+/// The path of an ONVIF device service (Core Specification, 5.1.1).
+const DEVICE_SERVICE: &str = "/onvif/device_service";
+
+/// The address that answers with a still picture, such as Frigate's `/api/<camera>/latest.jpg`, or that of an ONVIF camera,
+/// which knows where its pictures are. The password is never shown.
 #[derive(Clone, PartialEq, Eq)]
 pub struct SnapshotSource {
     url: String,
@@ -19,14 +25,15 @@ pub struct SnapshotSource {
 }
 
 impl SnapshotSource {
-    /// An address of HTTP or HTTPS with the name and password of HTTP's Basic authentication.
+    /// An address of HTTP, HTTPS or ONVIF (`onvif://HOST`, with a port or path where they are not the usual ones), with the
+    /// name and password of HTTP's Digest or Basic authentication.
     ///
     /// # Errors
     /// `InvalidArgument` naming `snapshot.url`, `snapshot.username` or `snapshot.password`.
     pub fn new(url: &str, username: Option<String>, password: Option<String>) -> Result<Self> {
         check_text("snapshot.url", url, MAX_URL_BYTES)?;
-        if !url.starts_with("http://") && !url.starts_with("https://") {
-            return Err(Error::invalid("snapshot.url", "must begin with http:// or https://"));
+        if !["http://", "https://", ONVIF].iter().any(|scheme| url.starts_with(scheme)) {
+            return Err(Error::invalid("snapshot.url", "must begin with http://, https:// or onvif://"));
         }
         for (field, text) in [("snapshot.username", &username), ("snapshot.password", &password)] {
             text.as_deref().map_or(Ok(()), |text| check_text(field, text, MAX_CREDENTIAL_BYTES))?;
@@ -41,6 +48,22 @@ impl SnapshotSource {
     #[must_use]
     pub fn url(&self) -> &str {
         &self.url
+    }
+
+    /// True if the address is that of an ONVIF device.
+    #[must_use]
+    pub fn is_onvif(&self) -> bool {
+        self.url.starts_with(ONVIF)
+    }
+
+    /// The address by HTTP: of the picture, or of the ONVIF device service.
+    #[must_use]
+    pub fn http_url(&self) -> Cow<'_, str> {
+        match self.url.strip_prefix(ONVIF) {
+            Some(device) if device.contains('/') => Cow::Owned(format!("http://{device}")),
+            Some(device) => Cow::Owned(format!("http://{device}{DEVICE_SERVICE}")),
+            None => Cow::Borrowed(&self.url),
+        }
     }
 
     /// The name to sign in with.
@@ -92,6 +115,18 @@ mod tests {
         let elsewhere = source("http://192.0.2.8/still.jpg", None).with_known_password(Some(&known));
         assert_eq!(elsewhere.password(), None);
         assert!(!format!("{known:?}").contains("s3cret"), "{known:?}");
+    }
+
+    #[test]
+    fn a_device_is_asked_at_its_service() {
+        for (url, expected) in [
+            ("onvif://192.0.2.7", "http://192.0.2.7/onvif/device_service"),
+            ("onvif://192.0.2.7:8899", "http://192.0.2.7:8899/onvif/device_service"),
+            ("onvif://camera/own/service", "http://camera/own/service"),
+            ("https://192.0.2.7/still.jpg", "https://192.0.2.7/still.jpg"),
+        ] {
+            assert_eq!(source(url, None).http_url(), expected);
+        }
     }
 
     #[test]

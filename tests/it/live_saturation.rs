@@ -86,6 +86,7 @@ async fn a_flooded_import_notices_the_end_of_the_server() {
     first_is_sent.recv().await.expect("the import has begun");
     let ended = tokio::task::spawn_blocking(move || server.terminate());
     let status = importing.await.expect("no panic").expect_err("the server ends");
-    assert_eq!(status.code(), Code::Unavailable, "{status:?}");
+    // The server's status is lost where the connection ends with a part of the flood unread: tonic calls it internal.
+    assert!(matches!(status.code(), Code::Unavailable | Code::Internal), "{status:?}");
     assert!(ended.await.expect("no panic"), "the server ends in order");
 }

@@ -266,13 +266,13 @@ test.describe('two operators', () => {
   test('somebody else has changed the profile', async ({ console: page, server }) => {
     await server.request('POST', '/v1/cameras', { id: 'gate', display_name: 'Gate' });
     await page.goto(`${server.url}/#/cameras/gate/profile`);
-    await expect(page.getByLabel('Name')).toHaveValue('Gate');
+    await expect(page.getByLabel('Name', { exact: true })).toHaveValue('Gate');
     await server.request('PATCH', '/v1/cameras/gate', { display_name: 'Other' }, 'application/json', { 'if-match': '*' });
-    await page.getByLabel('Name').fill('Mine');
+    await page.getByLabel('Name', { exact: true }).fill('Mine');
     await page.getByRole('button', { name: 'Save' }).click();
     await expect(page.getByRole('alert')).toContainText('Somebody else has changed the profile');
     await page.getByRole('button', { name: 'Read again' }).click();
-    await expect(page.getByLabel('Name')).toHaveValue('Other');
+    await expect(page.getByLabel('Name', { exact: true })).toHaveValue('Other');
     await page.getByLabel('Type gate to confirm').fill('gate');
     await page.getByRole('button', { name: 'Delete camera' }).click();
     await expect(page.getByText('No camera yet')).toBeVisible();

@@ -30,21 +30,13 @@ impl<R: Read> GnssLoggerFixes<R> {
     }
 
     pub(super) fn next_row(&mut self) -> Option<Result<Result<FixRow, RowError>>> {
-        loop {
-            let (line, text) = match self.lines.next_text().transpose()? {
-                Err(error) => return Some(Err(error)),
-                Ok((_, Err(row))) => return Some(Ok(Err(row))),
-                Ok((line, Ok(text))) => (line, text),
-            };
+        let Self { lines, columns, time_bounds } = self;
+        lines.find_row(|line, text| {
             if let Some(names) = text.strip_prefix('#').and_then(|it| it.trim().strip_prefix(FIX)) {
-                self.columns = names.split(',').map(|name| name.trim().to_owned()).collect();
-            } else if let Some(values) = text.strip_prefix(FIX) {
-                let row = fix_of(line, values, &self.columns, &self.time_bounds);
-                if let Some(row) = row.transpose() {
-                    return Some(row.or_else(|error| RowError::of(line, error).map(Err)));
-                }
+                *columns = names.split(',').map(|name| name.trim().to_owned()).collect();
             }
-        }
+            text.strip_prefix(FIX).map_or(Ok(None), |values| fix_of(line, values, columns, time_bounds))
+        })
     }
 }
 

@@ -89,21 +89,12 @@ impl<R: Read> GpsdFixes<R> {
     }
 
     pub(super) fn next_row(&mut self) -> Option<Result<Result<FixRow, RowError>>> {
-        loop {
-            let (line, text) = match self.lines.next_text().transpose()? {
-                Err(error) => return Some(Err(error)),
-                Ok((_, Err(row))) => return Some(Ok(Err(row))),
-                Ok((line, Ok(text))) => (line, text),
-            };
-            if text.is_empty() {
-                continue;
-            }
-            match self.reports.fix(line, text, &self.time_bounds) {
-                Ok(None) => {}
-                Ok(Some(row)) => return Some(Ok(row)),
-                Err(error) => return Some(RowError::of(line, error).map(Err)),
-            }
-        }
+        let Self { lines, reports, time_bounds } = self;
+        lines.find_row(
+            |line, text| {
+                if text.is_empty() { Ok(None) } else { reports.fix(line, text, time_bounds) }
+            },
+        )
     }
 }
 

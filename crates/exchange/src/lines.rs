@@ -24,11 +24,32 @@ pub(super) struct Lines<R> {
 }
 
 impl<R: Read> Lines<R> {
+    /// The next row that `read` finds in a line, by the line's number and its text without spaces about it; a line that is no
+    /// text, or that `read` refuses, is a row that failed. `None` at the end of the file.
+    ///
+    /// # Errors
+    /// The file cannot be read, or a fault of `read`.
+    pub(super) fn find_row<T>(
+        &mut self,
+        mut read: impl FnMut(u64, &str) -> Result<Option<Result<T, RowError>>>,
+    ) -> Option<Result<Result<T, RowError>>> {
+        loop {
+            let (line, text) = match self.next_text().transpose()? {
+                Err(error) => return Some(Err(error)),
+                Ok((_, Err(row))) => return Some(Ok(Err(row))),
+                Ok((line, Ok(text))) => (line, text),
+            };
+            if let Some(row) = read(line, text).transpose() {
+                return Some(row.or_else(|error| RowError::of(line, error).map(Err)));
+            }
+        }
+    }
+
     /// The next line and its number, without spaces about it, or why it is no text; `None` at the end of the file.
     ///
     /// # Errors
     /// The file cannot be read.
-    pub(super) fn next_text(&mut self) -> Result<Option<(u64, Result<&str, RowError>)>> {
+    fn next_text(&mut self) -> Result<Option<(u64, Result<&str, RowError>)>> {
         let Some((number, line)) = self.next_line().map_err(Error::fault)? else { return Ok(None) };
         let text = match line {
             Line::Text(text) => Ok(text.trim()),

@@ -57,19 +57,18 @@ impl<R: Read> RtklibFixes<R> {
     }
 
     pub(super) fn next_row(&mut self) -> Option<Result<Result<FixRow, RowError>>> {
-        loop {
-            let (line, text) = match self.lines.next_text().transpose()? {
-                Err(error) => return Some(Err(error)),
-                Ok((_, Err(row))) => return Some(Ok(Err(row))),
-                Ok((line, Ok(text))) => (line, text),
-            };
+        let Self { lines, header, time_bounds } = self;
+        lines.find_row(|line, text| {
             if let Some(comment) = text.strip_prefix('%') {
-                self.header = Header::of(comment).or(self.header.take());
-            } else if !text.is_empty() {
-                let row = fix_of(line, text, self.header.as_ref(), &self.time_bounds);
-                return Some(row.or_else(|error| RowError::of(line, error).map(Err)));
+                *header = Header::of(comment).or(header.take());
+                return Ok(None);
             }
-        }
+            if text.is_empty() {
+                Ok(None)
+            } else {
+                fix_of(line, text, header.as_ref(), time_bounds).map(Some)
+            }
+        })
     }
 }
 

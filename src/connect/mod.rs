@@ -29,6 +29,7 @@ mod publish;
 mod push;
 mod rtsp;
 mod serial;
+mod sign_in;
 mod sink;
 mod snapshot;
 mod source;

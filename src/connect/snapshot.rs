@@ -1,7 +1,6 @@
 //! Still pictures from the snapshot addresses of cameras.
 
 use bytes::Bytes;
-use http_auth::{PasswordClient, PasswordParams};
 use http_body_util::{BodyExt as _, Full, Limited};
 use hyper::body::Incoming;
 use hyper::client::conn::http1;
@@ -12,6 +11,7 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::credentials::{Credentials, PeerError};
 use super::peer::{OPEN_TIME, connect, within};
+use super::sign_in::SignIn;
 use crate::app::App;
 use crate::domain::{CameraId, Error, ErrorKind, Picture, PictureFormat, Result, SnapshotSource};
 use crate::exchange::{Address, OnvifRequest, SOAP, Scheme, Secrets, bracketed};
@@ -34,7 +34,8 @@ pub async fn fetch_snapshot(app: &App, id: &CameraId) -> Result<Picture> {
 }
 
 async fn fetch(source: &SnapshotSource, most_bytes: usize) -> Result<Picture, PeerError> {
-    let mut camera = Camera { address: Address::of_http(&source.http_url())?, source, challenge: None };
+    let sign_in = SignIn::new(source.username(), source.password());
+    let mut camera = Camera { address: Address::of_http(&source.http_url())?, sign_in };
     if source.is_onvif() {
         camera.find_snapshot().await?;
     }
@@ -44,15 +45,13 @@ async fn fetch(source: &SnapshotSource, most_bytes: usize) -> Result<Picture, Pe
 }
 
 /// The peer of a snapshot address.
-struct Camera<'a> {
+struct Camera {
     /// Where it is asked next.
     address: Address,
-    source: &'a SnapshotSource,
-    /// How it wants the user to prove the password.
-    challenge: Option<PasswordClient>,
+    sign_in: SignIn,
 }
 
-impl Camera<'_> {
+impl Camera {
     /// Asks the ONVIF device service at the address for that of the still picture.
     async fn find_snapshot(&mut self) -> Result<(), PeerError> {
         self.address.path = self.ask_device(&OnvifRequest::MediaService).await?;
@@ -108,11 +107,7 @@ impl Camera<'_> {
             _ => request.header(CONTENT_TYPE, SOAP),
         };
         let body = Bytes::from(body);
-        if let (Some(username), Some(challenge)) = (self.source.username(), &mut self.challenge) {
-            let password = self.source.password().unwrap_or_default();
-            let (uri, method, body) = (path.as_str(), method.as_str(), Some(&body[..]));
-            let proof = challenge.respond(&PasswordParams { username, password, uri, method, body });
-            let proof = proof.map_err(|error| PeerError(format!("cannot sign in: {error}")))?;
+        if let Some(proof) = self.sign_in.authorization(method.as_str(), path, &body)? {
             let mut proof = HeaderValue::from_str(&proof).map_err(|error| PeerError(error.to_string()))?;
             proof.set_sensitive(true);
             request = request.header(AUTHORIZATION, proof);
@@ -121,14 +116,10 @@ impl Camera<'_> {
     }
 
     fn take_challenge(&mut self, refusal: &Response<Incoming>) -> Result<(), PeerError> {
-        if self.source.username().is_none() {
-            return Err("the address asks for a user; give snapshot.username and snapshot.password".into());
-        }
+        let no_user = "the address asks for a user; give snapshot.username and snapshot.password";
         let challenges = refusal.headers().get_all(WWW_AUTHENTICATE).iter();
         let challenges: Vec<_> = challenges.filter_map(|challenge| challenge.to_str().ok()).collect();
-        let challenge = PasswordClient::try_from(challenges.join(", ").as_str());
-        self.challenge = Some(challenge.map_err(|error| PeerError(format!("cannot sign in: {error}")))?);
-        Ok(())
+        self.sign_in.take_challenge(&challenges.join(", "), no_user)
     }
 }
 

@@ -3,7 +3,6 @@
 use std::time::Duration;
 
 use futures_util::{SinkExt as _, StreamExt as _};
-use http_auth::{PasswordClient, PasswordParams};
 use rtsp_types::headers::{
     ACCEPT, AUTHORIZATION, CONTENT_BASE, CSEQ, PUBLIC, RANGE, SESSION, TRANSPORT, USER_AGENT,
     WWW_AUTHENTICATE,
@@ -16,6 +15,7 @@ use super::codec::Codec;
 use super::description::Controls;
 use crate::connect::credentials::{Credentials, PeerError};
 use crate::connect::peer::{ByteStream, connect};
+use crate::connect::sign_in::SignIn;
 use crate::exchange::{Address, Scheme, bracketed};
 
 /// Time after which a server ends a session that it has not heard of, where it does not state one (RFC 2326, 12.37).
@@ -106,18 +106,14 @@ impl Session {
 /// Requests and their answers.
 struct Connection {
     stream: Framed<Box<dyn ByteStream>, Codec>,
-    /// Name and password.
-    user: Option<(String, String)>,
-    /// How the camera wants the user to prove the password.
-    challenge: Option<PasswordClient>,
+    sign_in: SignIn,
     sequence: u32,
 }
 
 impl Connection {
     fn new(stream: Box<dyn ByteStream>, credentials: &Credentials<'_>) -> Self {
-        let password = credentials.secrets.get("password").unwrap_or_default();
-        let user = credentials.username.map(|name| (name.to_owned(), password.to_owned()));
-        Self { stream: Framed::new(stream, Codec), user, challenge: None, sequence: 0 }
+        let sign_in = SignIn::new(credentials.username, credentials.secrets.get("password"));
+        Self { stream: Framed::new(stream, Codec), sign_in, sequence: 0 }
     }
 
     async fn send(
@@ -131,7 +127,7 @@ impl Connection {
             .request_uri(url.clone())
             .header(CSEQ, self.sequence.to_string())
             .header(USER_AGENT, "sightfix");
-        let authorization = self.authorization(method, url)?;
+        let authorization = self.sign_in.authorization(method.into(), url.as_str(), &[])?;
         let authorization = authorization.as_deref().map(|value| (AUTHORIZATION, value));
         let headers = headers.iter().cloned().chain(authorization);
         let request = headers.fold(request, |request, (name, value)| request.header(name, value));
@@ -174,22 +170,8 @@ impl Connection {
     }
 
     fn take_challenge(&mut self, refusal: &Response<Vec<u8>>) -> Result<(), PeerError> {
-        if self.user.is_none() {
-            return Err("the camera asks for a user; give username and the secret password".into());
-        }
-        let challenge = PasswordClient::try_from(header(refusal, &WWW_AUTHENTICATE));
-        self.challenge = Some(challenge.map_err(|error| PeerError(format!("cannot sign in: {error}")))?);
-        Ok(())
-    }
-
-    /// The header that proves the password, once the camera has asked for it.
-    fn authorization(&mut self, method: &Method, url: &Url) -> Result<Option<String>, PeerError> {
-        let (Some((username, password)), Some(challenge)) = (&self.user, &mut self.challenge) else {
-            return Ok(None);
-        };
-        let (method, uri) = (method.into(), url.as_str());
-        let proof = challenge.respond(&PasswordParams { username, password, uri, method, body: Some(&[]) });
-        proof.map(Some).map_err(|error| PeerError(format!("cannot sign in: {error}")))
+        let no_user = "the camera asks for a user; give username and the secret password";
+        self.sign_in.take_challenge(header(refusal, &WWW_AUTHENTICATE), no_user)
     }
 }
 

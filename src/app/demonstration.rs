@@ -5,9 +5,10 @@ use std::sync::Mutex;
 use tokio_util::sync::CancellationToken;
 
 use super::App;
+use super::live::sync::lock;
 use crate::domain::{CameraId, ConnectionId, ErrorKind, Result, SiteId};
 
-/// What a demonstration has made, which its end removes.
+/// The cameras, sites and connections that a demonstration has made, which its end removes.
 #[derive(Debug, Clone, Default)]
 pub struct DemonstrationParts {
     pub cameras: Vec<CameraId>,
@@ -24,18 +25,14 @@ impl Demonstration {
     #[must_use]
     pub fn begin(&self, parts: DemonstrationParts) -> CancellationToken {
         let stop = CancellationToken::new();
-        *self.lock() = Some((parts, stop.clone()));
+        *lock(&self.0) = Some((parts, stop.clone()));
         stop
     }
 
     /// True while simulated devices send to the server, or what they need is not removed yet.
     #[must_use]
     pub fn is_shown(&self) -> bool {
-        self.lock().is_some()
-    }
-
-    fn lock(&self) -> std::sync::MutexGuard<'_, Option<(DemonstrationParts, CancellationToken)>> {
-        self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+        lock(&self.0).is_some()
     }
 }
 
@@ -46,7 +43,7 @@ impl App {
     /// # Errors
     /// `RunLive` while one of its cameras is trained; a fault of the store.
     pub async fn end_demonstration(&self) -> Result<()> {
-        let Some((parts, stop)) = self.demonstration.lock().clone() else { return Ok(()) };
+        let Some((parts, stop)) = lock(&self.demonstration.0).clone() else { return Ok(()) };
         stop.cancel();
         for id in &parts.connections {
             removed(self.delete_connection(id, None).await, ErrorKind::ConnectionNotFound)?;
@@ -57,12 +54,12 @@ impl App {
         for id in &parts.sites {
             removed(self.sites().delete(id, None).await, ErrorKind::SiteNotFound)?;
         }
-        *self.demonstration.lock() = None;
+        *lock(&self.demonstration.0) = None;
         Ok(())
     }
 }
 
-/// What somebody else has removed before is removed.
+/// Counts as removed if somebody else has removed it before.
 fn removed(outcome: Result<()>, missing: ErrorKind) -> Result<()> {
     outcome.or_else(|error| if error.kind() == missing { Ok(()) } else { Err(error) })
 }

@@ -5,6 +5,7 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use super::App;
+use super::live::sync::lock;
 use crate::domain::{CameraId, Error, ErrorKind, NewCamera, Picture, Result, SnapshotSource};
 use crate::exchange::Address;
 
@@ -21,7 +22,7 @@ impl SnapshotTimes {
     /// # Errors
     /// `RateLimited` within the pause.
     fn take(&self, id: &CameraId, now: Duration) -> Result<()> {
-        let mut asked = self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let mut asked = lock(&self.0);
         asked.retain(|_, at| now.saturating_sub(*at) < SNAPSHOT_PAUSE);
         if asked.contains_key(id) {
             let message = "a picture of this camera was fetched within the last 2 s; read it instead";

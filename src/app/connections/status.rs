@@ -1,7 +1,7 @@
 //! The present status of connections: state, counts, the last message. In memory, since the server was started.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
 use tokio::sync::{Notify, SetOnce, mpsc, oneshot, watch};
 
+use crate::app::live::sync::lock;
 use crate::domain::{ConnectionId, ConnectionKey};
 
 /// Bytes of a message that are shown.
@@ -260,10 +261,6 @@ impl ConnectionBoard {
     pub async fn changed(&self) {
         self.changed.notified().await;
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

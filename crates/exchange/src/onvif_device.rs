@@ -38,7 +38,7 @@ impl OnvifRequest {
         )
     }
 
-    /// What the answer says. Of addresses it is path and query alone: the device may know itself by another name and port
+    /// The value in the answer. Addresses are reduced to path and query: the device may know itself by another name and port
     /// than its clients, and nobody else is to be asked.
     ///
     /// # Errors

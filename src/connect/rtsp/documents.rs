@@ -56,7 +56,7 @@ impl Documents {
     }
 }
 
-/// What is used of a packet (RFC 3550, 5.1).
+/// The parts of a packet that are used (RFC 3550, 5.1).
 struct Packet<'a> {
     is_last: bool,
     sequence: u16,

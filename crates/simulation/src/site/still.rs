@@ -37,7 +37,7 @@ pub struct Still {
     pub rgb: Vec<u8>,
 }
 
-/// What each camera of a site sees while nobody is in view, at half the resolution of its image.
+/// The picture that each camera of a site has while nobody is in view, at half the resolution of its image.
 #[must_use]
 pub fn site_stills(options: &SiteOptions) -> Vec<Still> {
     layout::cameras(options).iter().map(still).collect()
@@ -64,7 +64,7 @@ fn ground_colour(camera: &SiteCamera, ground: EastNorth) -> Colour {
     blend(SKY, material(ground, clarity), clarity.sqrt())
 }
 
-/// What the ground consists of. Fine patterns fade with the clarity, or they would flicker in the distance.
+/// The colour of the ground. Fine patterns fade with the clarity, or they would flicker in the distance.
 fn material(EastNorth { east_m, north_m }: EastNorth, clarity: f64) -> Colour {
     if north_m < PAVING_END_M {
         let is_joint = east_m.rem_euclid(SLAB_M) < JOINT_M || north_m.rem_euclid(SLAB_M) < JOINT_M;

@@ -4,7 +4,7 @@ use jiff::Timestamp;
 
 use crate::geo::Position;
 
-/// What a ship reports of itself.
+/// The state that a ship reports.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ShipState {
     /// Station identity (MMSI), nine digits.

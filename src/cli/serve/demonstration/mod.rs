@@ -41,7 +41,7 @@ const SITE: &str = "demo-square";
 const PHONES: &str = "demo-phones";
 const SHIP: &str = "demo-ship";
 
-/// What the ramp has recorded when the demonstration begins, so that it learns within the next minute.
+/// Time that the ramp has recorded when the demonstration begins, so that it learns within the next minute.
 const RECORDED: Duration = Duration::from_secs(420);
 
 fn places() -> [Place; 3] {
@@ -186,7 +186,7 @@ pub(super) async fn run(app: &App, address: SocketAddr, now: Timestamp) -> anyho
     Ok(())
 }
 
-/// What the end of the demonstration removes.
+/// The parts that the end of the demonstration removes.
 fn parts() -> anyhow::Result<DemonstrationParts> {
     let cameras = places().into_iter().flat_map(|place| place.cameras);
     let cameras = cameras.map(|(id, _)| CameraId::new(id)).collect::<Result<_, _>>()?;

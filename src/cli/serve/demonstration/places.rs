@@ -111,7 +111,7 @@ fn options(seed: u64, east_m: f64) -> SiteOptions {
     SiteOptions { seed, camera_seed: seed, receiver_seed: seed, origin, duration_s, ..square }
 }
 
-/// What the cameras of a place are trained on: all targets carry a receiver.
+/// The site that the cameras of a place are trained on: all targets carry a receiver.
 pub(super) fn training_site(place: &Place) -> SimulatedSite {
     simulate_site(&SiteOptions {
         seed: place.options.seed + TRAINING_SEED,
@@ -151,7 +151,7 @@ fn fixes_of_targets(site: &SimulatedSite) -> FixesOfTargets {
     site.fixes.iter().filter_map(of_target).collect()
 }
 
-/// What the stream of each camera of a place sends, in the order of time.
+/// The items that the stream of each camera of a place sends, in the order of time.
 pub(super) fn items(place: &Place, site: &SimulatedSite) -> Vec<Vec<LiveItem>> {
     let fixes = fixes_of_targets(site);
     let carriers: BTreeSet<&TargetId> = site.carriers.iter().map(|(_, target)| target).collect();
@@ -218,7 +218,7 @@ pub(super) struct Report<T> {
     pub(super) state: T,
 }
 
-/// What the phones of a place report, in the order of time: their names and positions.
+/// Reports of the phones of a place, in the order of time: their names and positions.
 pub(super) fn phone_reports(place: &Place, site: &SimulatedSite) -> Vec<Report<(ReceiverId, Position)>> {
     let first = site.carriers.first().map(|(receiver, _)| receiver);
     let report = |received: &ReceivedFix| {
@@ -231,7 +231,7 @@ pub(super) fn phone_reports(place: &Place, site: &SimulatedSite) -> Vec<Report<(
     site.fixes.iter().filter_map(report).collect()
 }
 
-/// What the ship's transponder sends, every two seconds.
+/// Reports of the ship's transponder, every two seconds.
 pub(super) fn ship_reports(place: &Place) -> Vec<Report<ShipState>> {
     let plane = LocalPlane::new(place.options.origin);
     let report = |second: u32| {

@@ -55,6 +55,12 @@ pub enum AuditAction {
     SiteChanged,
     /// A site was deleted.
     SiteDeleted,
+    /// A place was created.
+    PlaceCreated,
+    /// A place was changed.
+    PlaceChanged,
+    /// A place was deleted with its events and counts.
+    PlaceDeleted,
     /// A connection with another system was created.
     ConnectionCreated,
     /// A connection was changed, paused or resumed.

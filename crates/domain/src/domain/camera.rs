@@ -7,6 +7,7 @@ use jiff::Timestamp;
 use super::bounding_box::ImageSize;
 use super::error::{Error, ErrorKind, Result};
 use super::gnss_error::{GnssBiasSigma, GnssError};
+use super::history::HistorySettings;
 use super::names::{CameraId, SiteId, TargetClass, check_labels, check_text};
 use super::receiver::Receivers;
 use super::recipe::Recipe;
@@ -50,6 +51,8 @@ pub struct NewCamera {
     pub site: Option<SiteId>,
     /// Where a still picture of what the camera sees is fetched.
     pub snapshot: Option<SnapshotSource>,
+    /// How finished tracks are kept; `None` keeps none.
+    pub history: Option<HistorySettings>,
 }
 
 impl NewCamera {
@@ -71,6 +74,7 @@ impl NewCamera {
             learn_automatically: true,
             site: None,
             snapshot: None,
+            history: None,
         }
     }
 
@@ -145,11 +149,13 @@ pub struct CameraChange {
     pub site: Option<Option<SiteId>>,
     /// New address of a still picture; `Some(None)` removes it. Without a password, that of the same address is kept.
     pub snapshot: Option<Option<SnapshotSource>>,
+    /// New settings of the history; `Some(None)` keeps no more tracks.
+    pub history: Option<Option<HistorySettings>>,
 }
 
 impl CameraChange {
     /// Names of the fields that can be changed, on both transports.
-    pub const FIELDS: [&str; 13] = [
+    pub const FIELDS: [&str; 14] = [
         "display_name",
         "image_size",
         "gnss_error",
@@ -163,6 +169,7 @@ impl CameraChange {
         "learn_automatically",
         "site",
         "snapshot",
+        "history",
     ];
 
     /// The fields of a profile that are named, by [`Self::FIELDS`].
@@ -182,6 +189,7 @@ impl CameraChange {
             learn_automatically: is_named("learn_automatically").then_some(profile.learn_automatically),
             site: is_named("site").then_some(profile.site),
             snapshot: is_named("snapshot").then_some(profile.snapshot),
+            history: is_named("history").then_some(profile.history),
         }
     }
 
@@ -208,6 +216,7 @@ impl CameraChange {
                 Some(new) => new.map(|new| new.with_known_password(profile.snapshot.as_ref())),
                 None => profile.snapshot,
             },
+            history: self.history.unwrap_or(profile.history),
         }
         .check()
     }

@@ -55,6 +55,10 @@ pub enum ErrorKind {
     SiteExists,
     /// The site has cameras.
     SiteInUse,
+    /// No such place.
+    PlaceNotFound,
+    /// A place of that id exists already.
+    PlaceExists,
     /// No such connection.
     ConnectionNotFound,
     /// A connection of that id exists already.

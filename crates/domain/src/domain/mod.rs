@@ -16,6 +16,7 @@ mod durability;
 mod error;
 mod evaluation;
 mod gnss_error;
+mod history;
 mod idempotency;
 mod image_area;
 mod job;
@@ -29,6 +30,7 @@ mod noise;
 mod observation;
 mod on_conflict;
 mod picture;
+mod place;
 mod receiver;
 mod recipe;
 mod recording_part;
@@ -40,6 +42,7 @@ mod site;
 mod site_training;
 mod snapshot;
 mod time;
+mod track_scope;
 mod training_run;
 
 pub use access::{ApiKey, KeyId, KeySecret, NewKey, Role, Scope, SecretDigest};
@@ -55,22 +58,27 @@ pub use durability::Durability;
 pub use error::{Error, ErrorKind, Fault, MOST_VIOLATIONS, Refusal, Result, Violation, convert_all};
 pub use evaluation::{EvaluationJob, EvaluationPlan, EvaluationProgress, TimeRange, Truth};
 pub use gnss_error::{GnssBiasSigma, GnssError, SigmaM};
+pub use history::{ArchivedPosition, HistoryKey, HistorySettings, TRACK_GAP};
 pub use idempotency::{IdempotencyKey, IdempotentRequest, RequestDigest, RequestHasher};
 pub use image_area::ImageArea;
 pub use job::{EvaluationId, JobState, RunId};
 pub use live_id::LiveId;
 pub use method::{InferenceMode, Method};
 pub use model_format::ModelFormat;
-pub use motion::{Course, Motion, Velocity};
+pub use motion::{Acceleration, Course, Motion, Velocity};
 pub use names::{
-    CameraId, ConnectionId, MAX_LABELS, ReceiverId, SiteId, TargetClass, TargetId, TrackerId, check_labels,
-    check_text,
+    CameraId, ConnectionId, MAX_LABELS, PlaceId, ReceiverId, SiteId, TargetClass, TargetId, TrackerId,
+    check_labels, check_text,
 };
 pub use node::{Node, NodeId, NodeProfile};
 pub use noise::{GaussMarkovNoise, NoiseCorrelation, SessionBias};
 pub use observation::{Confidences, Detection, Fix, Flag, FusedFix, LiveItem, Observation, ReceiverMatch};
 pub use on_conflict::OnConflict;
 pub use picture::{Picture, PictureFormat};
+pub use place::{
+    NewPlace, NewPlaceEvent, Place, PlaceCount, PlaceEventFilter, PlaceKey, StoredPlaceEvent,
+    StoredPlaceEvents,
+};
 pub use receiver::{ClockOffset, ReceivedFix, Receiver, Receivers};
 pub use recipe::Recipe;
 pub use recording_part::{RecordingBounds, RecordingPart};
@@ -82,6 +90,7 @@ pub use site::{NewSite, Site, SiteChange, SiteKey};
 pub use site_training::{SiteCameraFinding, SiteTrainingOptions, SiteTrainingReport};
 pub use snapshot::SnapshotSource;
 pub use time::{TimeBounds, parse_time, parse_time_in, parse_time_zone};
+pub use track_scope::TrackScope;
 pub use training_run::{
     CandidateFinding, CandidateReport, EpochReport, FeatureScale, GnssErrorSource, HeldOutError,
     HeldOutSampleError, JointTraining, ModelMetadata, ModelVersion, OriginDeg, RunProgress, TrainingOptions,

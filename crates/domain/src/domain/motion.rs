@@ -33,6 +33,17 @@ impl Velocity {
     }
 }
 
+/// A mean acceleration in a local plane.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Acceleration {
+    /// Component towards east, m/s2.
+    pub east_m_s2: f64,
+    /// Component towards north, m/s2.
+    pub north_m_s2: f64,
+    /// Covariance of its error, m2/s4.
+    pub covariance: PlaneCovariance,
+}
+
 /// Speed and course of a target at one instant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Motion {

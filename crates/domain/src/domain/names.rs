@@ -59,6 +59,10 @@ slug!(
     /// Id of a connection with another system: a slug like that of a camera.
     ConnectionId
 );
+slug!(
+    /// Id of a place: a slug like that of a camera.
+    PlaceId
+);
 
 fn check_slug(id: &str) -> Result<()> {
     let inner = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';

@@ -64,6 +64,7 @@ pub struct Observation {
     tracker_id: Option<TrackerId>,
     bounding_box: Option<BoundingBox>,
     fix: Option<Fix>,
+    class: Option<TargetClass>,
 }
 
 /// The receiver that the target of a box carries, by association.
@@ -87,7 +88,7 @@ impl Observation {
         if bounding_box.is_none() && fix.is_none() {
             return Err(Error::invalid("bounding_box", "give a bounding_box, a fix, or both"));
         }
-        Ok(Self { time, target_id, tracker_id: None, bounding_box, fix })
+        Ok(Self { time, target_id, tracker_id: None, bounding_box, fix, class: None })
     }
 
     /// Returns the observation of a box that has only the number of its camera's tracker.
@@ -102,6 +103,18 @@ impl Observation {
             ));
         }
         Ok(Self { tracker_id, ..self })
+    }
+
+    /// The same with the class that the detector reports.
+    #[must_use]
+    pub fn with_class(self, class: Option<TargetClass>) -> Self {
+        Self { class, ..self }
+    }
+
+    /// Class reported by the detector.
+    #[must_use]
+    pub const fn class(&self) -> Option<&TargetClass> {
+        self.class.as_ref()
     }
 
     /// The name under which the camera's tracker follows the target: its number, else the target. It stays when the
@@ -125,7 +138,7 @@ impl Observation {
         bounding_box: Option<BoundingBox>,
         fix: Fix,
     ) -> Self {
-        Self { time, target_id, tracker_id: None, bounding_box, fix: Some(fix) }
+        Self { time, target_id, tracker_id: None, bounding_box, fix: Some(fix), class: None }
     }
 
     /// Time of the measurement.

@@ -6,6 +6,7 @@ use jiff::Timestamp;
 
 use super::camera::{ExpectedVersion, Revision};
 use super::error::Result;
+use super::history::HistorySettings;
 use super::names::{SiteId, check_labels, check_text};
 use crate::geo::Position;
 
@@ -20,13 +21,21 @@ pub struct NewSite {
     pub labels: BTreeMap<String, String>,
     /// Origin of the plane in which targets are tracked; `None` for that of the first camera's model.
     pub origin: Option<Position>,
+    /// How finished world tracks are kept; `None` keeps none.
+    pub history: Option<HistorySettings>,
 }
 
 impl NewSite {
     /// A site with an id and defaults.
     #[must_use]
     pub fn named(id: SiteId) -> Self {
-        Self { display_name: id.as_str().to_owned(), id, labels: BTreeMap::new(), origin: None }
+        Self {
+            display_name: id.as_str().to_owned(),
+            id,
+            labels: BTreeMap::new(),
+            origin: None,
+            history: None,
+        }
     }
 
     /// # Errors
@@ -47,11 +56,13 @@ pub struct SiteChange {
     pub labels: Option<BTreeMap<String, String>>,
     /// New origin; `Some(None)` removes it.
     pub origin: Option<Option<Position>>,
+    /// New settings of the history; `Some(None)` keeps no more tracks.
+    pub history: Option<Option<HistorySettings>>,
 }
 
 impl SiteChange {
     /// Names of the fields that can be changed, on both transports.
-    pub const FIELDS: [&str; 3] = ["display_name", "labels", "origin"];
+    pub const FIELDS: [&str; 4] = ["display_name", "labels", "origin", "history"];
 
     /// The fields of a profile that are named, by [`Self::FIELDS`].
     #[must_use]
@@ -60,6 +71,7 @@ impl SiteChange {
             display_name: is_named("display_name").then_some(profile.display_name),
             labels: is_named("labels").then_some(profile.labels),
             origin: is_named("origin").then_some(profile.origin),
+            history: is_named("history").then_some(profile.history),
         }
     }
 
@@ -73,6 +85,7 @@ impl SiteChange {
             display_name: self.display_name.unwrap_or(profile.display_name),
             labels: self.labels.unwrap_or(profile.labels),
             origin: self.origin.unwrap_or(profile.origin),
+            history: self.history.unwrap_or(profile.history),
         }
         .check()
     }

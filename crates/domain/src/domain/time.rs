@@ -81,6 +81,9 @@ pub fn parse_time(text: &str) -> Result<Timestamp> {
         {
             invalid("is outside of the times that can be represented, which end in the year 9999")
         }
+        Err(_) if local_time(text).is_some() => invalid(
+            "has no offset from UTC; write it, as in 2020-12-14T14:41:48+08:00, or import the rows with `timezone`",
+        ),
         Err(_) => invalid(
             "must be RFC 3339 with an offset, such as 2020-12-14T14:41:48+08:00 or 2020-12-14T06:41:48Z",
         ),
@@ -104,10 +107,7 @@ pub fn parse_time_zone(name: &str) -> Result<TimeZone> {
 /// As [`parse_time`]; names the field `time` for a local time that the zone skips or has twice.
 pub fn parse_time_in(text: &str, zone: &TimeZone) -> Result<Timestamp> {
     parse_time(text).or_else(|error| {
-        let is_local = !has_offset(text) && !names_leap_second(text);
-        let Some(civil) = is_local.then(|| text.parse::<DateTime>().ok()).flatten() else {
-            return Err(error);
-        };
+        let civil = local_time(text).ok_or(error)?;
         zone.to_ambiguous_timestamp(civil).unambiguous().map_err(|_| {
             let zone = zone.iana_name().unwrap_or("its time zone");
             let message =
@@ -115,6 +115,12 @@ pub fn parse_time_in(text: &str, zone: &TimeZone) -> Result<Timestamp> {
             Error::invalid("time", message)
         })
     })
+}
+
+/// Text without an offset that names a date and time.
+fn local_time(text: &str) -> Option<DateTime> {
+    let is_local = !has_offset(text) && !names_leap_second(text);
+    is_local.then(|| text.parse().ok()).flatten()
 }
 
 /// The hours of an offset at the end, such as `+08:00`.
@@ -160,7 +166,7 @@ mod tests {
             ("2020-12-14T14:41:48+25:00", "offset"),
             ("2020-12-14T14:41:48-24:00", "offset"),
             ("9999-12-31T23:59:59Z", "9999"),
-            ("2020-12-14T14:41:48", "RFC 3339"),
+            ("2020-12-14T14:41:48", "`timezone`"),
             ("2020-13-14T14:41:48Z", "RFC 3339"),
             ("yesterday", "RFC 3339"),
             ("", "RFC 3339"),

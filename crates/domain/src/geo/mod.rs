@@ -15,3 +15,6 @@ pub use plane::{
 };
 pub use plane_covariance::{PlaneCovariance, R95_BY_RATIO};
 pub use position::{Position, PositionError, distance_m};
+
+/// Metres per degree at the equator, where a few tenths of a percent do not matter.
+pub const METRES_PER_DEGREE: f64 = 111_320.0;

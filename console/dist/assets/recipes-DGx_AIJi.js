@@ -1,1 +1,0 @@
-import{L as e}from"./app-qVTm3xh2.js";var t=`recipe.`,n=Object.keys(e.en).filter(e=>e.startsWith(t)).map(e=>e.slice(7));export{n as t};

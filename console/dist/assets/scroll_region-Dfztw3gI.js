@@ -1,1 +1,0 @@
-function e(e){function t(){e.scrollWidth<=e.clientWidth?e.removeAttribute(`tabindex`):(e.tabIndex=0,e.setAttribute(`role`,`region`),e.setAttribute(`aria-label`,e.closest(`section`)?.querySelector(`h2, h3`)?.textContent??``))}let n=new ResizeObserver(t);n.observe(e);for(let t of e.children)n.observe(t);return()=>n.disconnect()}export{e as t};

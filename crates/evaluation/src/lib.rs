@@ -46,4 +46,5 @@ pub use truth::truth_from_geojson;
 use sightfix_domain::{domain, geo, statistics};
 use sightfix_fusion as fusion;
 use sightfix_model::{self as model, filters};
+use sightfix_places as places;
 use sightfix_simulation as simulation;

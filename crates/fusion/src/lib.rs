@@ -8,6 +8,7 @@
 //! | [`clock_offset`] | the offset between a receiver's clock and the camera's |
 //! | [`association`] | which box shows the carrier of which receiver, where boxes have only the ids of a tracker |
 //! | [`track`], [`target_track`] | the filtered path of one target in one camera |
+//! | [`smoother`] | the paths of finished tracks |
 //! | [`frame_assembler`], [`world`] | frames of several cameras, and the tracks of a site through all of them |
 //! | [`drift_detector`] | alarms when a camera was moved |
 //!
@@ -26,6 +27,7 @@ pub mod drift_detector;
 pub mod frame_assembler;
 pub mod observed;
 pub mod pairing;
+pub mod smoother;
 pub mod target_track;
 pub mod track;
 pub mod two_step;

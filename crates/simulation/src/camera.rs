@@ -28,6 +28,12 @@ pub(super) struct PinholeCamera {
 }
 
 impl PinholeCamera {
+    /// Distance of a point of the plane to the right of the optical axis, m.
+    pub(super) fn right_m(&self, EastNorth { east_m, north_m }: EastNorth) -> f64 {
+        let (sin_pan, cos_pan) = self.pan_deg.to_radians().sin_cos();
+        cos_pan * east_m - sin_pan * north_m
+    }
+
     /// Column and row of a point, px; `None` behind the camera.
     pub(super) fn project(&self, point: Point) -> Option<[f64; 2]> {
         let (sin_pan, cos_pan) = self.pan_deg.to_radians().sin_cos();
@@ -35,7 +41,7 @@ impl PinholeCamera {
         let EastNorth { east_m, north_m } = point.ground;
         let down_m = self.height_m - point.up_m;
         let ahead_m = sin_pan * east_m + cos_pan * north_m;
-        let right_m = cos_pan * east_m - sin_pan * north_m;
+        let right_m = self.right_m(point.ground);
         let depth_m = cos_tilt * ahead_m + sin_tilt * down_m;
         if depth_m < 0.1 {
             return None;

@@ -18,6 +18,7 @@
 
 #![warn(missing_docs)]
 
+mod airport_form;
 mod camera;
 mod noise;
 mod options;
@@ -34,6 +35,7 @@ mod target;
 mod tracker;
 mod world;
 
+pub use airport_form::AirportForm;
 pub use noise::{SimulatedReceiver, standard_normal, stream};
 pub use options::{Options, Route};
 #[cfg(feature = "testing")]

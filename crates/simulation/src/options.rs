@@ -1,12 +1,19 @@
 //! The options that determine a simulated world.
 
 use jiff::{SignedDuration, Timestamp};
+use rand::Rng;
 
+use super::airport_form::AirportForm;
+use super::camera::PinholeCamera;
 use super::scene::Scene;
 use super::shape::TargetShape;
+use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
 
 /// Default time of the first row: 2026-01-05T08:00:00Z, in seconds since 1970.
 const START_S: i64 = 1_767_600_000;
+
+/// White part of a phone's error per axis, m, as measured; the rest is a Gauss-Markov bias.
+const PHONE_WHITE_M: f64 = 0.13;
 
 /// Where the targets move.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,6 +33,8 @@ pub enum Route {
 pub struct Options {
     /// The scene.
     pub scene: Scene,
+    /// Camera, ground and lines of an airport.
+    pub airport_form: AirportForm,
     /// Seed of everything but the camera.
     pub seed: u64,
     /// Seed of the camera's height, focal length and orientation.
@@ -49,6 +58,9 @@ pub struct Options {
     pub target_shape: Option<TargetShape>,
     /// Standard deviation per axis of a receiver's error, m.
     pub gnss_sigma_m: f64,
+    /// Time constant of that error beside a white part of 0.13 m, s; `None` for that of the scene, which is white at the
+    /// airport.
+    pub gnss_time_constant_s: Option<f64>,
     /// Standard deviation per axis of an additional error that each receiver keeps for a whole session, m.
     pub gnss_bias_sigma_m: f64,
     /// Standard deviation of each edge of a bounding box, px.
@@ -85,6 +97,7 @@ impl Options {
     pub fn new(scene: Scene) -> Self {
         Self {
             scene,
+            airport_form: AirportForm::Plain,
             seed: 1,
             camera_seed: 1,
             samples: 10_000,
@@ -99,6 +112,7 @@ impl Options {
                 Scene::Airport => 29.5,
                 Scene::Square => 2.2,
             },
+            gnss_time_constant_s: None,
             gnss_bias_sigma_m: 0.0,
             box_noise_px: 1.0,
             lens_distortion: -0.02,
@@ -147,6 +161,23 @@ impl Options {
             start: self.later(index as i64),
             ..self.clone()
         }
+    }
+
+    /// Draws the camera.
+    pub(super) fn camera(&self, random: &mut impl Rng) -> PinholeCamera {
+        let drawn = self.scene.camera(self.border_cuts, random);
+        self.airport_form.camera(PinholeCamera { lens_distortion: self.lens_distortion, ..drawn })
+    }
+
+    /// The error model of a receiver.
+    pub(super) fn receiver_error(&self, random: &mut impl Rng) -> GaussMarkovNoise {
+        let sigma_m = self.gnss_sigma_m;
+        let own_s = self.scene.gnss_time_constant_s(random);
+        let Some(time_constant_s) = self.gnss_time_constant_s.or(own_s) else {
+            return GaussMarkovNoise::white(sigma_m * sigma_m);
+        };
+        let white_share = (PHONE_WHITE_M / sigma_m).min(1.0).powi(2);
+        GaussMarkovNoise::new(sigma_m, NoiseCorrelation { white_share, time_constant_s })
     }
 
     fn later(&self, days: i64) -> Timestamp {

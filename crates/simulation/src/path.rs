@@ -98,6 +98,13 @@ impl Polyline {
         poses
     }
 
+    /// The polyline with all distances from the plane's origin multiplied.
+    pub(super) fn scaled(&self, factor: f64) -> Self {
+        let scaled =
+            |point: &EastNorth| EastNorth { east_m: factor * point.east_m, north_m: factor * point.north_m };
+        Self { points: self.points.iter().map(scaled).collect() }
+    }
+
     /// Two straight legs joined by a curve about the corner.
     pub(super) fn bent(from: EastNorth, corner: EastNorth, to: EastNorth, radius_m: f64) -> Self {
         let unit = |tip: EastNorth| {

@@ -5,14 +5,12 @@ use std::f64::consts::TAU;
 use rand::{Rng, RngExt};
 use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
+use super::airport_form::AirportForm;
 use super::camera::{PinholeCamera, Point};
 use super::path::{MotionProfile, Polyline, Pose};
 use super::shape::TargetShape;
-use crate::domain::{Error, GaussMarkovNoise, ImageSize, NoiseCorrelation};
+use crate::domain::{Error, ImageSize};
 use crate::geo::{EastNorth, Position};
-
-/// White part of a phone's error per axis, m, as measured; the rest is a Gauss-Markov bias.
-const PHONE_WHITE_M: f64 = 0.13;
 
 /// A kind of site with its targets and receivers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Display, EnumString, IntoStaticStr, VariantArray)]
@@ -54,12 +52,7 @@ impl Scene {
 
     /// Draws a camera. On the square a longer focal length makes the border truncate boxes; at the
     /// airport the aircraft enters and leaves across the border in any case.
-    pub(super) fn camera(
-        self,
-        border_cuts: bool,
-        lens_distortion: f64,
-        random: &mut impl Rng,
-    ) -> PinholeCamera {
+    pub(super) fn camera(self, border_cuts: bool, random: &mut impl Rng) -> PinholeCamera {
         let (size, height_m, focal_px, tilt_deg) = match self {
             Self::Airport => ((1920, 1080), 30.0, 1660.0, 4.0),
             Self::Square => ((1280, 720), 7.0, if border_cuts { 1800.0 } else { 1080.0 }, 13.0),
@@ -70,18 +63,19 @@ impl Scene {
             focal_px: focal_px * random.random_range(0.96..1.04),
             pan_deg: 360.0 * random.random::<f64>(),
             tilt_deg: tilt_deg + random.random_range(-0.7..0.7),
-            lens_distortion,
+            lens_distortion: 0.0,
         }
     }
 
     /// The lines that targets follow in turn, about the camera's optical axis.
-    pub(super) fn paths(self, pan_deg: f64) -> Vec<Polyline> {
+    pub(super) fn paths(self, form: AirportForm, pan_deg: f64) -> Vec<Polyline> {
         let at = |right_m: f64, ahead_m: f64| rotated(right_m, ahead_m, pan_deg);
         match self {
             Self::Airport => {
                 let (from, to) = (at(-250.0, 260.0), at(250.0, 330.0));
                 let straight = Polyline { points: vec![from, to] };
-                vec![straight, Polyline::bent(from, at(30.0, 299.0), at(10.0, 620.0), 90.0)]
+                let bent = Polyline::bent(from, at(30.0, 299.0), at(10.0, 620.0), 90.0);
+                form.paths(vec![straight, bent], at)
             }
             Self::Square => vec![Polyline { points: vec![at(-9.0, 19.0), at(11.0, 25.0), at(2.0, 50.0)] }],
         }
@@ -124,15 +118,11 @@ impl Scene {
         }
     }
 
-    /// The error model of a receiver with that standard deviation per axis.
-    pub(super) fn receiver_error(self, sigma_m: f64, random: &mut impl Rng) -> GaussMarkovNoise {
+    /// Time constant of a receiver's error, s; `None` where that is white.
+    pub(super) fn gnss_time_constant_s(self, random: &mut impl Rng) -> Option<f64> {
         match self {
-            Self::Airport => GaussMarkovNoise::white(sigma_m * sigma_m),
-            Self::Square => {
-                let white_share = (PHONE_WHITE_M / sigma_m).min(1.0).powi(2);
-                let time_constant_s = random.random_range(35.0..60.0);
-                GaussMarkovNoise::new(sigma_m, NoiseCorrelation { white_share, time_constant_s })
-            }
+            Self::Airport => None,
+            Self::Square => Some(random.random_range(35.0..60.0)),
         }
     }
 

@@ -47,7 +47,7 @@ impl<'a> SimulatedTarget<'a> {
         let draw = |kind: u64| stream(options.seed, 16 * number + kind);
         let mut motion = draw(0);
         let mut receiver_parameters = draw(1);
-        let receiver_error = scene.receiver_error(options.gnss_sigma_m, &mut receiver_parameters);
+        let receiver_error = options.receiver_error(&mut receiver_parameters);
         let delay_s = if index == 0 { 0 } else { receiver_parameters.random_range(0..30) };
         // The first target has the scene's nominal size, so that one target is the paper's case.
         let scale = if index == 0 { 1.0 } else { 1.0 + 0.08 * standard_normal(&mut motion).clamp(-1.5, 1.5) };
@@ -156,7 +156,11 @@ impl<'a> SimulatedTarget<'a> {
         {
             camera.pan_deg += pan_deg;
         }
-        let body = self.options.scene.body(pose, &self.shape, self.scale, &mut self.body);
+        let mut body = self.options.scene.body(pose, &self.shape, self.scale, &mut self.body);
+        let ground_m = self.options.airport_form.ground_m(self.camera.right_m(pose.position));
+        for point in &mut body {
+            point.up_m += ground_m;
+        }
         let mut edges = camera.extents(&body)?;
         for edge in &mut edges {
             *edge += self.options.box_noise_px * standard_normal(&mut self.detector);

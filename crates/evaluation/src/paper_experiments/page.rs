@@ -118,7 +118,11 @@ pub(super) fn page(
         page,
         "All methods, quantiles, training time, ablations and the commands that reproduce a case are in"
     );
-    let _ = writeln!(page, "[{stem}-tables.md]({stem}-tables.md).");
+    let _ = writeln!(
+        page,
+        "[{stem}-tables.md]({stem}-tables.md). Cameras of other forms, hidden feet, wrong boxes and the first minutes are in"
+    );
+    let _ = writeln!(page, "[marks.md](marks.md).");
     page
 }
 

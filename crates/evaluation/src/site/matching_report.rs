@@ -10,7 +10,7 @@ use crate::domain::Recipe;
 use crate::model::FitError;
 
 /// The model that is known in a draw is trained on the carriers, fixes and boxes of the draw of this larger seed.
-const KNOWN_MODEL_SEEDS: u64 = 1_000_000;
+pub const KNOWN_MODEL_SEEDS: u64 = 1_000_000;
 /// Shift of the fixes, as a share of the recording, that leaves no identity true.
 const SHIFT: f64 = 0.4;
 

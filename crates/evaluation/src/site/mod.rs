@@ -4,10 +4,12 @@
 //! Definitions are in docs/explanation/world-tracks.md, with their sources.
 
 mod box_figures;
+mod crossing_figures;
 mod degradation;
 mod draw;
 mod matching_report;
 mod pair_figures;
+mod receiver_feed;
 mod receiver_matching;
 mod recording;
 mod report;
@@ -17,9 +19,11 @@ mod tests;
 mod world_figures;
 
 pub use box_figures::{BoxFigures, BoxRecord};
+pub use crossing_figures::{CrossingFigures, PlaceCounts};
 pub use degradation::Degradation;
-pub use matching_report::{JointFigures, MatchingCase, MatchingReport};
+pub use matching_report::{JointFigures, KNOWN_MODEL_SEEDS, MatchingCase, MatchingReport};
 pub use pair_figures::{Bin, PairFigures};
+pub use receiver_feed::NamedFigures;
 pub use receiver_matching::JointFound;
 pub use recording::{LabelledBox, RecordedCamera, RecordedFix, SiteRecording, Visits};
 pub use report::{SiteCase, SiteReport};

@@ -4,6 +4,8 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
+use super::crossing_figures::{CrossingFigures, PlaceCounts};
+use super::receiver_feed::NamedFigures;
 use super::runner::SiteOutcome;
 
 /// The figures of one way to track a site, or their means over draws.
@@ -31,6 +33,12 @@ pub struct SiteCase {
     pub mean_error_by_all_m: Option<f64>,
     /// Share of true positions inside the stated 95 % radius.
     pub coverage95: Option<f64>,
+    /// Receivers of tracks, over all draws, where fixes came.
+    pub named: Option<NamedFigures>,
+    /// Crossings of lines over the area, over all draws.
+    pub crossings: Option<CrossingFigures>,
+    /// Counts of lines over the area and of its middle, in the first draw.
+    pub counts: Vec<PlaceCounts>,
     /// Number of draws.
     pub draws: usize,
 }
@@ -67,6 +75,9 @@ impl SiteCase {
             mean_error_m: optional(&|it| it.positions.map(|positions| positions.mean_error_m)),
             mean_error_by_all_m: None,
             coverage95: optional(&|it| it.positions.map(|positions| positions.coverage95)),
+            named: outcomes.iter().filter_map(|it| it.named).reduce(NamedFigures::plus),
+            crossings: CrossingFigures::over_draws(outcomes.iter().filter_map(|it| it.crossings)),
+            counts: outcomes.first().map(|it| it.counts.clone()).unwrap_or_default(),
             draws: count,
         })
     }
@@ -104,6 +115,68 @@ impl SiteReport {
                 or_dash(case.mean_error_m),
                 or_dash(case.mean_error_by_all_m),
                 or_dash(case.coverage95),
+            );
+        }
+        table
+    }
+
+    /// The crossings of lines as a Markdown table.
+    #[must_use]
+    pub fn crossing_table(&self) -> String {
+        let mut table = String::from(
+            "| case | true crossings | reported | missed per 1,000 | false per 1,000 | mean error of the time s | true time \
+             in the interval % |\n|---|---|---|---|---|---|---|\n",
+        );
+        for (name, crossings) in self.cases.iter().filter_map(|case| Some((&case.name, case.crossings?))) {
+            let CrossingFigures { true_crossings, reported, missed_per_1000, false_per_1000, .. } = crossings;
+            let (mean_error_s, coverage) = (crossings.mean_error_s, 100.0 * crossings.coverage95);
+            // Writing to a string cannot fail.
+            let _ = writeln!(
+                table,
+                "| {name} | {true_crossings} | {reported} | {missed_per_1000:.0} | {false_per_1000:.0} | \
+                 {mean_error_s:.3} | {coverage:.1} |"
+            );
+        }
+        table
+    }
+
+    /// What places count in the first case, in its first draw, as a Markdown table.
+    #[must_use]
+    pub fn count_table(&self) -> String {
+        let mut table = String::from(
+            "| place | counted | truth | tracks | expected | 95 % interval |\n|---|---|---|---|---|---|\n",
+        );
+        for PlaceCounts { place, counted, truth, tracked } in
+            self.cases.first().iter().flat_map(|it| &it.counts)
+        {
+            let [low, high] = tracked.interval;
+            // Writing to a string cannot fail.
+            let _ = writeln!(
+                table,
+                "| {place} | {counted} | {truth} | {} | {:.1} | {low} to {high} |",
+                tracked.count, tracked.expected
+            );
+        }
+        table
+    }
+
+    /// The receivers of tracks as a Markdown table; empty where no fixes came.
+    #[must_use]
+    pub fn named_table(&self) -> String {
+        let mut table = String::new();
+        for (name, named) in self.cases.iter().filter_map(|case| Some((&case.name, case.named?))) {
+            if table.is_empty() {
+                table.push_str(
+                    "| case | boxes on tracks with a receiver | right | share of the carriers' boxes |\n|---|---|---|---|\n",
+                );
+            }
+            // Writing to a string cannot fail.
+            let _ = writeln!(
+                table,
+                "| {name} | {} | {:.3} | {:.3} |",
+                named.named,
+                named.right_share(),
+                named.found_share()
             );
         }
         table

@@ -5,10 +5,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use jiff::Timestamp;
 
 use super::box_figures::{BoxFigures, BoxRecord};
+use super::crossing_figures::{CrossingFigures, CrossingRecorder, PlaceCounts};
+use super::receiver_feed::{NamedFigures, ReceiverFeed};
 use super::recording::{LabelledBox, RecordedFix, SiteRecording};
 use super::world_figures::{PositionFigures, ReportedTrack, WorldFigures, WorldInstant};
 use crate::domain::{BoundingBox, ImageSize, ReceiverId};
-use crate::fusion::world::{CameraFrame, WorldDetection, WorldTrackSettings, WorldTracker};
+use crate::fusion::world::{CameraFrame, WorldDetection, WorldTrack, WorldTrackSettings, WorldTracker};
 use crate::geo::PlaneCovariance;
 use crate::model::{
     RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, SitePosition, box_at,
@@ -49,6 +51,12 @@ pub struct SiteOutcome {
     pub boxes: BoxFigures,
     /// Positions within 1 m.
     pub world: WorldFigures,
+    /// Crossings of lines over the area.
+    pub crossings: Option<CrossingFigures>,
+    /// Counts of lines over the area and of its middle.
+    pub counts: Vec<PlaceCounts>,
+    /// The receivers of tracks, where fixes came.
+    pub named: Option<NamedFigures>,
     /// Errors of the positions.
     pub positions: Option<PositionFigures>,
     /// The same of the targets that one camera of the recording sees, by camera.
@@ -159,7 +167,8 @@ fn labelled_box_at(boxes: &[&LabelledBox], time: Timestamp) -> Option<BoundingBo
 }
 
 /// Tracks the boxes of some cameras and scores the tracks against the truth; `visible` is the recording whose boxes
-/// say which targets can be seen at all.
+/// say which targets can be seen at all. With `fixes`, those of the recording are matched with the tracks as in the
+/// service.
 #[must_use]
 pub fn track_site(
     recording: &SiteRecording,
@@ -167,6 +176,7 @@ pub fn track_site(
     trained: &TrainedSite,
     identities: Identities,
     cameras: &[usize],
+    fixes: bool,
 ) -> SiteOutcome {
     let mut frames: BTreeMap<Timestamp, BTreeMap<usize, Vec<&LabelledBox>>> = BTreeMap::new();
     for &camera in cameras {
@@ -179,9 +189,14 @@ pub fn track_site(
     let views: Vec<_> = (0..visible.cameras.len()).map(|camera| visible.visible_to(&[camera])).collect();
     let mut instants_in_view: Vec<Vec<WorldInstant>> = vec![Vec::new(); views.len()];
     let mut tracker = WorldTracker::new(recording.plane, WorldTrackSettings::default());
+    let mut crossings = CrossingRecorder::over(recording.plane, recording.truth.values().copied());
     let (mut records, mut instants) = (Vec::new(), Vec::new());
+    let mut receivers = fixes.then(|| ReceiverFeed::new(recording));
     for (time, by_camera) in frames {
         let first = records.len();
+        if let Some(receivers) = &mut receivers {
+            receivers.advance(&mut tracker, time);
+        }
         for (camera, boxes) in by_camera {
             let detections = boxes
                 .iter()
@@ -189,6 +204,9 @@ pub fn track_site(
                 .collect();
             let id = recording.cameras[camera].id.clone();
             let outcome = tracker.observe(&CameraFrame { camera: id, time, detections });
+            if let Some(receivers) = &mut receivers {
+                receivers.observe(&tracker, &outcome, &boxes);
+            }
             records.extend(boxes.iter().zip(outcome.tracks).map(|(labelled, track)| BoxRecord {
                 camera,
                 time,
@@ -203,12 +221,19 @@ pub fn track_site(
             let targets = view.get(&time).into_iter().flatten().filter_map(position).collect();
             instants.push(WorldInstant { targets, tracks: tracks.clone() });
         }
-        let targets = in_view.get(&time).into_iter().flatten().filter_map(position).collect();
+        let targets: Vec<_> = in_view.get(&time).into_iter().flatten().filter_map(position).collect();
+        if let Some(crossings) = &mut crossings {
+            crossings.observe(time, measured(&tracker, time), &targets);
+        }
         instants.push(WorldInstant { targets, tracks });
     }
+    let (crossings, counts) = crossings.map(CrossingRecorder::figures).unwrap_or_default();
     SiteOutcome {
         boxes: BoxFigures::of(&records),
         world: WorldFigures::of(&instants),
+        crossings,
+        counts,
+        named: receivers.map(ReceiverFeed::figures),
         positions: PositionFigures::of(&instants),
         positions_in_view: instants_in_view.iter().map(|own| PositionFigures::of(own)).collect(),
     }
@@ -233,13 +258,17 @@ fn detection(
     }
 }
 
-/// The confirmed tracks that a camera measured at an instant, each with the target of most of its boxes.
+/// The confirmed tracks that a camera measured at an instant; those of fixes alone are no findings of the cameras.
+fn measured(tracker: &WorldTracker, time: Timestamp) -> impl Iterator<Item = &WorldTrack> {
+    let is_measured =
+        move |last_seen: Timestamp| time.duration_since(last_seen).as_secs_f64() <= REPORTED_WITHIN_S;
+    let is_seen = |track: &WorldTrack| track.is_confirmed() && !track.sightings().is_empty();
+    tracker.tracks().filter(move |track| is_seen(track) && is_measured(track.last_seen()))
+}
+
+/// The same, each with the target of most of its boxes.
 fn reported(tracker: &WorldTracker, time: Timestamp, records: &[BoxRecord]) -> Vec<ReportedTrack> {
-    let is_reported =
-        |last_seen: Timestamp| time.duration_since(last_seen).as_secs_f64() <= REPORTED_WITHIN_S;
-    tracker
-        .tracks()
-        .filter(|track| track.is_confirmed() && is_reported(track.last_seen()))
+    measured(tracker, time)
         .map(|track| {
             let mut boxes: BTreeMap<usize, usize> = BTreeMap::new();
             for target in records.iter().filter(|it| it.track == Some(track.id())).filter_map(|it| it.target)

@@ -129,7 +129,7 @@ fn a_site_trained_together_has_better_positions_and_states_less_than_each_camera
         let recording = simulated(seed);
         let run = |training| {
             let trained = train_site(&recording, training).expect("trained");
-            track_site(&recording, &recording, &trained, Identities::Tracked, &[0, 1, 2])
+            track_site(&recording, &recording, &trained, Identities::Tracked, &[0, 1, 2], false)
         };
         together.push(run(SiteTraining::Together));
         apart.push(run(SiteTraining::Apart));
@@ -157,8 +157,8 @@ fn degraded_boxes_cost_some_identity_not_most_of_it() {
     let boxes =
         |recording: &SiteRecording| -> usize { recording.cameras.iter().map(|it| it.boxes.len()).sum() };
     assert_ne!(boxes(&recording), boxes(&degraded));
-    let clean = track_site(&recording, &recording, &trained, Identities::Tracked, &[0, 1, 2]);
-    let rough = track_site(&degraded, &recording, &trained, Identities::Tracked, &[0, 1, 2]);
+    let clean = track_site(&recording, &recording, &trained, Identities::Tracked, &[0, 1, 2], false);
+    let rough = track_site(&degraded, &recording, &trained, Identities::Tracked, &[0, 1, 2], false);
     println!("{clean:?}\n{rough:?}");
     assert!(rough.boxes.identity_f1 > clean.boxes.identity_f1 - 0.2, "{rough:?}");
 }

@@ -18,6 +18,12 @@ const ENTERING_S: f64 = 2.0;
 /// Distance of companions in the image, in heights of their boxes.
 const APART_HEIGHTS: f64 = 0.7;
 
+/// Probability that the target of a track of several cameras, rather than a companion that no detector finds, is the one
+/// whose place it shows.
+pub(super) fn missed_companion_factor() -> f64 {
+    1.0 / (1.0 + IN_COMPANY * MISSED)
+}
+
 /// The view as the boxes of a recording show it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct View {

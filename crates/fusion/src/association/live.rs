@@ -43,6 +43,14 @@ impl Default for LiveMatchSettings {
     }
 }
 
+impl LiveMatchSettings {
+    /// Bounds for the world tracks of a site, which are smoother than boxes, and more.
+    #[must_use]
+    pub fn of_site() -> Self {
+        Self { min_interval: SignedDuration::from_millis(900), max_rows: 30_000, ..Self::default() }
+    }
+}
+
 /// After this number of boxes in a row that are older than the window, the recording has begun again.
 const RESTART_AFTER: u32 = 50;
 
@@ -145,6 +153,14 @@ impl LiveWindow {
         self.trackers.get(tracker_id).map(|own| own.since)
     }
 
+    /// True if a tracker's id is in view still.
+    #[must_use]
+    pub fn is_in_view(&self, tracker_id: &TargetId) -> bool {
+        let last = self.trackers.get(tracker_id).map(|own| own.last);
+        last.zip(self.latest)
+            .is_some_and(|(last, latest)| latest.duration_since(last).as_secs_f64() <= TRACKLET_GAP_S)
+    }
+
     /// Its boxes and fixes, as a recording.
     #[must_use]
     pub fn recording(&self) -> (Vec<Detection>, Vec<ReceivedFix>) {
@@ -207,6 +223,12 @@ impl LiveMatches {
     pub fn get(&self, tracker_id: &TargetId, seen_since: Timestamp) -> Option<&ReceiverMatch> {
         let held = self.0.get(tracker_id).filter(|own| own.seen_until >= seen_since)?;
         Some(&held.receiver_match)
+    }
+
+    /// The trackers' ids that were matched with a receiver.
+    pub fn trackers_of(&self, receiver_id: &ReceiverId) -> impl Iterator<Item = &TargetId> {
+        let is_its = move |own: &&HeldMatch| own.receiver_match.receiver_id == *receiver_id;
+        self.0.iter().filter(move |(_, own)| is_its(own)).map(|(tracker_id, _)| tracker_id)
     }
 
     /// The matches after the window's boxes were matched again. Of each tracker's id the piece with its latest box counts:

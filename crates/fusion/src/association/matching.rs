@@ -24,7 +24,7 @@ const OFFSET_STEP_S: f64 = 0.5;
 const LEAST_PROBABILITY: f64 = 0.01;
 /// White error per axis that every receiver has at least, m: differences of its fixes are not trusted
 /// further.
-const LEAST_WHITE_SIGMA_M: f64 = 0.5;
+pub(super) const LEAST_WHITE_SIGMA_M: f64 = 0.5;
 
 /// How tracklets are matched with receivers.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -225,30 +225,15 @@ pub(super) fn match_located(
     let offsets_s = clock_offsets_s(located, &model, settings, cancellation)?;
     let timed: Vec<(&[TimedFix], f64)> =
         located.fixes.iter().map(Vec::as_slice).zip(offsets_s.iter().copied()).collect();
-    let pieces = cuts::pieces(located.tracklets, &timed, &model, &settings.chains);
-    let table = PieceTable::new(located.tracklets, pieces, model.motion, &settings.chains);
-    let chains: Vec<Vec<Chain>> = timed
-        .iter()
-        .map(|(fixes, offset_s)| {
-            cancellation.check()?;
-            Ok(table.chains(fixes, *offset_s, &model, &settings.chains))
-        })
-        .collect::<Result<_>>()?;
-    let probabilities = posterior(&chains, table.pieces.len(), random, cancellation)?;
-    let most_probable = |at: usize| {
-        let all = probabilities.iter().map(|own| own[at]).enumerate();
-        all.max_by(|one, other| one.1.total_cmp(&other.1))
-    };
+    let owned = owned_pieces(located.tracklets, &timed, &model, &settings.chains, random, cancellation)?;
     let mut matching = Matching {
         tracklets: located.tracklets.len(),
         receivers: scene.receiver_ids.len(),
-        cuts: table.pieces.len() - located.tracklets.len(),
+        cuts: owned.len().saturating_sub(located.tracklets.len()),
         ..Matching::default()
     };
     let view = View::of(scene.detections);
-    for (at, piece) in table.pieces.iter().enumerate() {
-        let Some((receiver, probability)) = most_probable(at) else { continue };
-        let Piece { tracklet, first, end } = *piece;
+    for OwnedPiece { piece: Piece { tracklet, first, end }, receiver, probability } in owned {
         let detections = &located.detections[tracklet][first..end];
         let probability = probability * view.own_probability(scene.detections, detections);
         if probability >= LEAST_PROBABILITY {
@@ -265,6 +250,41 @@ pub(super) fn match_located(
         .filter_map(|(id, offset_s)| Some((id.clone(), ClockOffset::from_seconds(offset_s).ok()?)))
         .collect();
     Ok(matching)
+}
+
+/// A piece of a tracklet and the receiver, by its index, that its target carries most probably.
+pub(super) struct OwnedPiece {
+    pub(super) piece: Piece,
+    pub(super) receiver: usize,
+    pub(super) probability: f64,
+}
+
+/// The pieces of all tracklets in their order, each with its most probable receiver; none without receivers. Each receiver
+/// has its fixes and the offset of its clock, s.
+pub(super) fn owned_pieces(
+    tracklets: &[Tracklet],
+    receivers: &[(&[TimedFix], f64)],
+    model: &EvidenceModel,
+    settings: &ChainSettings,
+    random: &mut impl Rng,
+    cancellation: Cancellation<'_>,
+) -> Result<Vec<OwnedPiece>> {
+    let pieces = cuts::pieces(tracklets, receivers, model, settings);
+    let table = PieceTable::new(tracklets, pieces, model.motion, settings);
+    let chains: Vec<Vec<Chain>> = receivers
+        .iter()
+        .map(|(fixes, offset_s)| {
+            cancellation.check()?;
+            Ok(table.chains(fixes, *offset_s, model, settings))
+        })
+        .collect::<Result<_>>()?;
+    let probabilities = posterior(&chains, table.pieces.len(), random, cancellation)?;
+    let owned = |(at, piece): (usize, &Piece)| {
+        let all = probabilities.iter().map(|own| own[at]).enumerate();
+        let (receiver, probability) = all.max_by(|one, other| one.1.total_cmp(&other.1))?;
+        Some(OwnedPiece { piece: *piece, receiver, probability })
+    };
+    Ok(table.pieces.iter().enumerate().filter_map(owned).collect())
 }
 
 /// The clock offset of each receiver with the largest evidence, over all chains, under a normal prior.

@@ -2,7 +2,7 @@
 //!
 //! [`match_with_model`] compares fixes with regressed positions; [`match_without_model`] finds the camera,
 //! too. `docs/explanation/association.md` has the formulas and figures. The files in the order of their imports:
-//! `cancellation`, `tracklet`, `disjoint`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`.
+//! `cancellation`, `tracklet`, `disjoint`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`, `world_receivers`.
 //! Does not use I/O, clocks, or randomness that is not handed in.
 
 mod assignment;
@@ -19,12 +19,14 @@ mod matching;
 mod placement;
 mod recording;
 mod tracklet;
+mod world_receivers;
 
 pub use self::cancellation::Cancellation;
 pub use self::chains::ChainSettings;
 pub use self::joint::{JointMatch, WorldScores, joint_pairing, match_without_model};
 pub use self::live::{LiveMatchSettings, LiveMatches, LiveWindow};
 pub use self::matching::{MatchLimits, MatchSettings, MatchedPiece, Matching, match_with_model};
+pub use self::world_receivers::{WorldReceiverWindow, WorldReceivers};
 
 #[cfg(test)]
 mod tests;

@@ -5,6 +5,7 @@
 //! Does not contain history, time to live, or out-of-sequence measurements ([`super::Track`]).
 
 use jiff::Timestamp;
+use nalgebra::Matrix4;
 
 use super::agreement::{Agreement, Expected};
 use super::camera_error::CameraError;
@@ -19,8 +20,11 @@ use super::state::TrackState;
 use crate::domain::Velocity;
 use crate::geo::EastNorth;
 use crate::geo::PlaneCovariance;
+use crate::smoother::FilterMoments;
 
 const MODES: usize = 3;
+/// Components of a mode's state that are position and velocity.
+const KINEMATIC: usize = GNSS_BIAS;
 /// Index of the stationary mode; steady and agile follow.
 const STATIONARY: usize = 0;
 const AGILE: usize = 2;
@@ -48,6 +52,8 @@ pub(super) struct ImmFilter {
     awaits_fix: bool,
     /// Square of the highest speed observed with confidence, decaying, m2/s2.
     speed_envelope_m2_s2: f64,
+    /// Spectral density of the acceleration of each mode in the latest prediction, m2/s3.
+    acceleration_m2_s3: [f64; MODES],
 }
 
 impl ImmFilter {
@@ -75,6 +81,7 @@ impl ImmFilter {
             agreement: Agreement::default(),
             awaits_fix: false,
             speed_envelope_m2_s2: motion.min_speed_m_s.powi(2),
+            acceleration_m2_s3: [0.0, motion.steady_m2_s3, motion.steady_m2_s3],
         }
     }
 
@@ -107,6 +114,7 @@ impl ImmFilter {
         self.camera.travel(self.mean_speed_m_s() * step_s);
         // Stationary variance of the agile velocity = speed envelope: density = 2 v^2 / tau.
         let agile_m2_s3 = 2.0 * self.speed_envelope_m2_s2 / motion.agile_time_constant_s;
+        self.acceleration_m2_s3 = [0.0, motion.steady_m2_s3, agile_m2_s3];
         let transitions = [
             Transition::stationary(step_s, motion.stationary_m2_s),
             Transition::ornstein_uhlenbeck(step_s, motion.steady_m2_s3, motion.steady_time_constant_s),
@@ -430,6 +438,7 @@ impl ImmFilter {
             velocity: Velocity { east_m_s, north_m_s },
             covariance,
             velocity_covariance,
+            moments: self.filter_moments(),
             r95_m: self.agreement.radius_m(self.time, covariance.r95_m()),
             stationary_probability: self.mode_probabilities[STATIONARY],
             nis: None,
@@ -438,6 +447,23 @@ impl ImmFilter {
             restarted: false,
             sources_disagree: self.agreement.verdict().disagrees,
         }
+    }
+
+    /// The moments of position and velocity over the modes without the biases, which last along a track, and the mean of their
+    /// acceleration noise.
+    fn filter_moments(&self) -> FilterMoments {
+        let mean: [f64; KINEMATIC] = std::array::from_fn(|state| self.mean_of(state));
+        let covariance = Matrix4::from_fn(|row, column| {
+            let modes = self.modes.iter().zip(self.mode_probabilities);
+            let moment = |mode: &ModeFilter| {
+                mode.covariance[row][column] - mode.bias_share(row, column)
+                    + (mode.mean[row] - mean[row]) * (mode.mean[column] - mean[column])
+            };
+            modes.map(|(mode, probability)| probability * moment(mode)).sum()
+        });
+        let densities = self.acceleration_m2_s3.iter().zip(self.mode_probabilities);
+        let acceleration_m2_s3 = densities.map(|(density, probability)| density * probability).sum();
+        FilterMoments { covariance, acceleration_m2_s3 }
     }
 
     /// Mean and stated covariance of a pair of components, position or velocity, over the modes.

@@ -362,6 +362,11 @@ impl ModeFilter {
         spanned_by(pair, [&self.covariance[CAMERA_BIAS], &self.covariance[CAMERA_BIAS + 1]])
     }
 
+    /// The part of a covariance of position or velocity that the biases of camera and receiver cause, as [`Self::camera_share`].
+    pub(super) fn bias_share(&self, row: usize, column: usize) -> f64 {
+        (GNSS_BIAS..STATES).map(|bias| self.covariance[row][bias] * self.covariance[column][bias]).sum()
+    }
+
     /// Covariance of a pair if all boxes shared one error, for the position `M_p M_p'`.
     pub(super) fn lasting_error(&self, pair: usize) -> PlaneCovariance {
         let [first, second] = &self.response;

@@ -6,6 +6,7 @@ use super::measurement::{MeasurementSource, Rejection};
 use crate::domain::{Motion, Velocity};
 use crate::geo::EastNorth;
 use crate::geo::PlaneCovariance;
+use crate::smoother::FilterMoments;
 
 /// The innovation of one accepted measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,6 +35,8 @@ pub struct TrackState {
     pub velocity_covariance: PlaneCovariance,
     /// Radius about `position` that contains the true position with 95 % probability, m.
     pub r95_m: f64,
+    /// What a smoother needs besides.
+    pub moments: FilterMoments,
     /// Probability of the stationary motion mode, 0 to 1.
     pub stationary_probability: f64,
     /// Sum of the NIS of the accepted positions of the latest measurement (2 degrees of freedom each).

@@ -7,6 +7,7 @@ use nalgebra::{Matrix2, Matrix4, Matrix4x2, Vector2, Vector4};
 use super::settings::WorldTrackSettings;
 use crate::domain::Velocity;
 use crate::geo::{EastNorth, PlaneCovariance};
+use crate::smoother::FilterMoments;
 
 /// Probability below which a mode is not left, so that it can be entered again.
 const LEAST_PROBABILITY: f64 = 1e-6;
@@ -111,6 +112,15 @@ impl ConstantVelocityFilter {
     /// Probability that the target is stationary, 0 to 1.
     pub(super) fn stationary_probability(&self) -> f64 {
         self.velocity().stationary_probability(self.velocity_covariance(), self.prior_speed_sigma_m_s)
+    }
+
+    /// What a smoother needs besides.
+    pub(super) fn moments(&self, settings: &WorldTrackSettings) -> FilterMoments {
+        let noises = settings.acceleration_noise_m2_s3.iter().zip(self.mode_probabilities);
+        FilterMoments {
+            covariance: moment_match(&self.modes, self.mode_probabilities).covariance,
+            acceleration_m2_s3: noises.map(|(noise, probability)| noise * probability).sum(),
+        }
     }
 
     fn covariance_of(&self, first: usize) -> PlaneCovariance {

@@ -67,7 +67,11 @@ fn is_near(one: &WorldTrack, other: &WorldTrack) -> bool {
     one.filter.position().distance_m(other.filter.position()) < FAR_M
 }
 
+/// A receiver's fixes are metres off: being near them for some frames does not tell who carries it.
 fn is_comparable(one: &WorldTrack, other: &WorldTrack) -> bool {
+    if one.is_measured_by_receiver() || other.is_measured_by_receiver() {
+        return false;
+    }
     let identities_differ =
         one.receiver.is_some() && other.receiver.is_some() && one.receiver != other.receiver;
     !identities_differ && seconds_from(other.last_seen, one.time) <= RECENT_S

@@ -1,10 +1,12 @@
 //! Behaviour of the world tracker on scripted targets.
 
+use std::collections::BTreeMap;
+
 use jiff::Timestamp;
 use rand::RngExt;
 
 use super::*;
-use crate::domain::{CameraId, ReceiverId, TargetId};
+use crate::domain::{CameraId, ReceiverId, ReceiverMatch, TargetId};
 use crate::geo::{EastNorth, LocalPlane, PlaneCovariance, Position};
 use crate::simulation::{standard_normal, stream};
 
@@ -166,6 +168,51 @@ fn the_identity_of_a_receiver_joins_what_the_trackers_ids_keep_apart() {
     assert_eq!(only_track(&outcome), by_fix);
     let jumped = tracker.track(by_fix).expect("live").state();
     assert!(jumped.position.distance_m(at(9.0, 0.0)) < 0.5, "{jumped:?}");
+}
+
+/// The tracker after 3 s in which a camera saw somebody stand 1 m beside a phone's fixes, and the track of that target.
+fn standing_beside_a_phone() -> (WorldTracker, WorldTrackId) {
+    let mut tracker = tracker();
+    let mut track = WorldTrackId(0);
+    for step in 0..6 {
+        let seconds = 0.5 * f64::from(step);
+        tracker.observe_fix(&receiver_id("phone"), at_s(seconds), at(1.0, 0.0), 2.5);
+        track = only_track(&tracker.observe(&frame("a", seconds, vec![seen(at(0.0, 0.0), Some("7"))])));
+    }
+    (tracker, track)
+}
+
+#[test]
+fn being_near_a_receiver_is_no_identity() {
+    let (tracker, track) = standing_beside_a_phone();
+    assert_eq!(tracker.tracks().count(), 2, "that of the fixes, and that of the boxes");
+    assert!(tracker.track(track).expect("live").receiver().is_none());
+}
+
+#[test]
+fn a_track_keeps_its_number_whatever_it_carries() {
+    let (mut tracker, track) = standing_beside_a_phone();
+    let carrying = |name: &str| ReceiverMatch { receiver_id: receiver_id(name), probability: 0.95 };
+    let gained = tracker.set_receiver_matches(&[(track, carrying("phone"))].into());
+    let kinds: Vec<&WorldEvent> = gained.iter().map(|own| &own.event).collect();
+    let is_expected = matches!(
+        kinds[..],
+        [WorldEvent::Identified { track: identified, .. }, WorldEvent::Merged { track: goes_on, .. }]
+            if *identified == track && *goes_on == track
+    );
+    assert!(is_expected, "the track of the fixes alone ends: {kinds:?}");
+    assert!(tracker.observe_fix(&receiver_id("phone"), at_s(3.0), at(1.0, 0.0), 2.5).track.is_none());
+    let changed = tracker.set_receiver_matches(&[(track, carrying("other"))].into());
+    assert!(
+        matches!(&changed[0].event, WorldEvent::Identified { receiver, .. } if receiver.as_str() == "other")
+    );
+    assert!(tracker.set_receiver_matches(&[(track, carrying("other"))].into()).is_empty());
+    assert!(tracker.set_receiver_matches(&BTreeMap::new()).is_empty());
+    let goes_on = tracker.observe(&frame("a", 3.5, vec![seen(at(0.0, 0.0), Some("7"))]));
+    assert_eq!(only_track(&goes_on), track);
+    assert!(tracker.track(track).expect("live").receiver_match().is_none());
+    let alone = tracker.observe_fix(&receiver_id("phone"), at_s(4.0), at(1.0, 0.0), 2.5).track;
+    assert!(alone.is_some_and(|alone| alone != track), "nobody is known to carry it");
 }
 
 #[test]

@@ -1,5 +1,7 @@
 //! The set of tracks of a site, camera by camera.
 
+use std::collections::BTreeMap;
+
 use jiff::Timestamp;
 
 use super::assignment::{Candidate, assign};
@@ -10,7 +12,7 @@ use super::frame::{
 use super::merging::MergeCandidates;
 use super::settings::WorldTrackSettings;
 use super::world_track::{WorldTrack, seconds_from};
-use crate::domain::{CameraId, ReceiverId};
+use crate::domain::{CameraId, ReceiverId, ReceiverMatch};
 use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
 
 /// The tracks of all targets of a site, from the detections of all its cameras and the fixes of its receivers.
@@ -147,6 +149,9 @@ impl WorldTracker {
             track.observe_fix(time, position, variance_m2, &self.settings);
             return FixOutcome { track: Some(track.id), events: Vec::new() };
         }
+        if self.tracks.iter().any(|track| track.is_matched_with(receiver)) {
+            return FixOutcome::default();
+        }
         if self.tracks.len() >= self.settings.max_tracks {
             return FixOutcome::default();
         }
@@ -158,6 +163,53 @@ impl WorldTracker {
             timed(WorldEvent::Identified { track: id, receiver: receiver.clone() }),
         ];
         FixOutcome { track: Some(id), events }
+    }
+
+    /// Says which receivers the targets of tracks carry, by association. All other tracks carry none. A track keeps its
+    /// number and its boxes whatever it carries; the track of a receiver's fixes alone ends where a camera's track is found to
+    /// be of the carrier.
+    pub fn set_receiver_matches(
+        &mut self,
+        matches: &BTreeMap<WorldTrackId, ReceiverMatch>,
+    ) -> Vec<TimedEvent> {
+        let Some(time) = self.time else { return Vec::new() };
+        let mut events = Vec::new();
+        for at in 0..self.tracks.len() {
+            let track = &mut self.tracks[at];
+            let own = matches.get(&track.id).filter(|_| track.receiver.is_none());
+            let before = std::mem::replace(&mut track.receiver_match, own.cloned());
+            let id = track.id;
+            if let Some(own) = own
+                && before.is_none_or(|before| before.receiver_id != own.receiver_id)
+            {
+                let receiver = own.receiver_id.clone();
+                events.push(TimedEvent { time, event: WorldEvent::Identified { track: id, receiver } });
+            }
+        }
+        events.extend(self.end_tracks_of_fixes(time));
+        events
+    }
+
+    /// Ends the tracks of fixes whose receivers' carriers cameras see by now.
+    fn end_tracks_of_fixes(&mut self, time: Timestamp) -> Vec<TimedEvent> {
+        let carriers: Vec<(ReceiverId, WorldTrackId)> = self
+            .tracks
+            .iter()
+            .filter_map(|track| Some((track.receiver_match.as_ref()?.receiver_id.clone(), track.id)))
+            .collect();
+        let carrier_of = |track: &WorldTrack| {
+            let receiver = track.receiver.as_ref().filter(|_| track.is_measured_by_receiver())?;
+            carriers.iter().find(|(carried, _)| carried == receiver).map(|(_, carrier)| *carrier)
+        };
+        let merged = |(ended, track): (WorldTrackId, WorldTrackId)| TimedEvent {
+            time,
+            event: WorldEvent::Merged { track, ended },
+        };
+        let ended: Vec<(WorldTrackId, WorldTrackId)> =
+            self.tracks.iter().filter_map(|track| Some((track.id, carrier_of(track)?))).collect();
+        self.tracks.retain(|track| ended.iter().all(|(id, _)| *id != track.id));
+        self.forget_ended_pairs();
+        ended.into_iter().map(merged).collect()
     }
 
     /// The pairs of detection and track within the gates.

@@ -6,9 +6,9 @@ use super::camera_offset::CameraOffset;
 use super::constant_velocity::ConstantVelocityFilter;
 use super::frame::{CameraFrame, WorldDetection, WorldTrackId};
 use super::settings::WorldTrackSettings;
-use crate::domain::{CameraId, ReceiverId, TargetId};
-use crate::domain::{Motion, Velocity};
+use crate::domain::{CameraId, Motion, ReceiverId, ReceiverMatch, TargetId, Velocity};
 use crate::geo::{EastNorth, PlaneCovariance};
+use crate::smoother::FilterMoments;
 
 /// States if a track is reported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -74,7 +74,10 @@ pub struct WorldTrack {
     pub(super) last_seen: Timestamp,
     pub(super) detections: u32,
     confirmed: bool,
+    /// By its name, which a client states.
     pub(super) receiver: Option<ReceiverId>,
+    /// By association.
+    pub(super) receiver_match: Option<ReceiverMatch>,
     sightings: Vec<Sighting>,
 }
 
@@ -135,6 +138,7 @@ impl WorldTrack {
             detections: 0,
             confirmed: false,
             receiver: None,
+            receiver_match: None,
             sightings: Vec::new(),
         }
     }
@@ -163,10 +167,20 @@ impl WorldTrack {
         self.time
     }
 
-    /// The receiver that the target carries, if it is known.
+    /// The receiver that the target carries, if a client names it or only its fixes measure the track.
     #[must_use]
     pub const fn receiver(&self) -> Option<&ReceiverId> {
         self.receiver.as_ref()
+    }
+
+    /// The receiver that the target carries with some probability, by association.
+    #[must_use]
+    pub const fn receiver_match(&self) -> Option<&ReceiverMatch> {
+        self.receiver_match.as_ref()
+    }
+
+    pub(super) fn is_matched_with(&self, receiver: &ReceiverId) -> bool {
+        self.receiver_match.as_ref().is_some_and(|own| own.receiver_id == *receiver)
     }
 
     /// The cameras that have seen it, in the order in which they first did.
@@ -208,14 +222,26 @@ impl WorldTrack {
     /// The state at [`Self::time`].
     #[must_use]
     pub fn state(&self) -> WorldState {
-        let lasting_m2 = self.offset_covariance_m2.plus(self.common_covariance_m2);
         WorldState {
             position: self.filter.position(),
             velocity: self.filter.velocity(),
             velocity_covariance: self.filter.velocity_covariance(),
             stationary_probability: self.filter.stationary_probability(),
-            covariance_m2: self.filter.position_covariance().plus(lasting_m2),
+            covariance_m2: self.filter.position_covariance().plus(self.lasting_covariance()),
         }
+    }
+
+    /// The part of the state's covariance that does not average out over some seconds: the camera's own and what all
+    /// cameras have in common, m2.
+    #[must_use]
+    pub fn lasting_covariance(&self) -> PlaneCovariance {
+        self.offset_covariance_m2.plus(self.common_covariance_m2)
+    }
+
+    /// What a smoother needs beside the state.
+    #[must_use]
+    pub fn moments(&self, settings: &WorldTrackSettings) -> FilterMoments {
+        self.filter.moments(settings)
     }
 
     /// The state predicted to another instant.
@@ -347,6 +373,7 @@ impl WorldTrack {
         self.detections += other.detections;
         self.confirmed |= other.confirmed;
         self.receiver = self.receiver.take().or(other.receiver);
+        self.receiver_match = self.receiver_match.take().or(other.receiver_match);
         for sighting in other.sightings {
             match self.sightings.iter_mut().find(|own| own.camera == sighting.camera) {
                 Some(own) if own.last_seen >= sighting.last_seen => {}

@@ -8,9 +8,9 @@ use crate::samples::sequences::sequences;
 use crate::uncertainty::scene::Scene;
 
 /// A box is frozen when it has been the same to the pixel for that many times as long as any of training, and
-/// [`LEAST_FROZEN_S`] more.
+/// [`LEAST_FROZEN_S`] more: some detectors repeat a box until they have the next one.
 const FROZEN_FACTOR: f64 = 2.0;
-const LEAST_FROZEN_S: f64 = 3.0;
+const LEAST_FROZEN_S: f64 = 2.0;
 
 /// Adds what the samples show to the parts of a model that was fitted to them.
 pub(super) fn put_scene(samples: &[Sample], regressor: &Regressor, parts: &mut ModelParts) {

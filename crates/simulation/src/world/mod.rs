@@ -52,8 +52,8 @@ const TRACKER_STREAM: u64 = 1 << 40;
 pub fn simulate(options: &Options) -> World {
     let scene = options.scene;
     let mut random = stream(options.camera_seed, 0);
-    let camera = scene.camera(options.border_cuts, options.lens_distortion, &mut random);
-    let mut paths = scene.paths(camera.pan_deg);
+    let camera = options.camera(&mut random);
+    let mut paths = scene.paths(options.airport_form, camera.pan_deg);
     if options.route == Route::NewLine {
         let offset_m = options.new_line_offset_m.unwrap_or(scene.new_line_offset_m());
         paths = paths.iter().map(|path| path.parallel(offset_m)).collect();

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::geo::{EastNorth, distance_m};
-use crate::{Scene, TargetShape};
+use crate::{AirportForm, Scene, TargetShape};
 
 fn plane_of(scene: Scene, position: Position) -> EastNorth {
     LocalPlane::new(scene.origin()).to_plane(position)
@@ -184,7 +184,7 @@ fn the_foot_of_a_large_target_is_far_from_its_antenna_depending_on_the_aspect() 
     let offsets_px = |target_shape| {
         let options =
             Options { target_shape, samples: 1_500, box_noise_px: 0.0, ..Options::new(Scene::Airport) };
-        let camera = options.scene.camera(true, options.lens_distortion, &mut stream(1, 0));
+        let camera = options.camera(&mut stream(1, 0));
         let plane = LocalPlane::new(Scene::Airport.origin());
         let offset = |row: &SimulatedRow| {
             let seen = row.bounding_box.filter(|seen| !seen.touches_border(Some(camera.image_size)))?;
@@ -265,4 +265,49 @@ fn targets_of_an_area_cover_it() {
             ahead_m.iter().fold((f64::INFINITY, 0.0_f64), |(near, far), &one| (near.min(one), far.max(one)));
         assert!(far_m > 2.0 * near_m, "{scene} {near_m} {far_m}");
     }
+}
+
+#[test]
+fn every_form_of_the_airport_has_boxes_of_its_own_on_the_same_truth_or_other_lines() {
+    let base = Options { samples: 600, border_cuts: false, ..Options::new(Scene::Airport) };
+    let plain = simulate(&base);
+    let boxes = |world: &World| -> Vec<_> { world.rows.iter().map(|row| row.bounding_box).collect() };
+    for &airport_form in AirportForm::ALL {
+        let world = simulate(&Options { airport_form, ..base.clone() });
+        assert_eq!(world.rows.len(), 600, "{airport_form}");
+        assert_eq!(airport_form == AirportForm::Plain, boxes(&world) == boxes(&plain), "{airport_form}");
+        let has_own_lines = [AirportForm::Telephoto, AirportForm::CurvedRunway].contains(&airport_form);
+        assert_eq!(has_own_lines, world.truth_lines != plain.truth_lines, "{airport_form}");
+        assert_eq!(airport_form.to_string().parse::<AirportForm>().expect("its name"), airport_form);
+    }
+}
+
+#[test]
+fn a_slope_raises_what_stands_on_its_right_side() {
+    let options =
+        Options { samples: 600, border_cuts: false, box_noise_px: 0.0, ..Options::new(Scene::Airport) };
+    let slope = Options { airport_form: AirportForm::Slope, ..options.clone() };
+    let of_both = simulate(&options).rows.into_iter().zip(simulate(&slope).rows);
+    let mut compared = 0;
+    for (flat, raised) in of_both.take_while(|(flat, raised)| flat.truth == raised.truth) {
+        let [flat, raised] = [flat, raised].map(|row| row.bounding_box.expect("a box").foot_px());
+        // The middle of the image is on the optical axis; the antenna is some metres from the foot.
+        if (flat[0] - 960.0).abs() > 200.0 {
+            assert_eq!(flat[0] > 960.0, raised[1] < flat[1], "{flat:?} {raised:?}");
+            compared += 1;
+        }
+    }
+    assert!(compared > 10, "{compared}");
+}
+
+#[test]
+fn a_receiver_with_a_time_constant_errs_alike_from_second_to_second() {
+    let white = Options { samples: 600, gnss_sigma_m: 6.0, ..Options::new(Scene::Airport) };
+    let coloured = Options { gnss_time_constant_s: Some(45.0), ..white.clone() };
+    let change_m = |options: &Options| {
+        let errors_m = gnss_errors_m(&simulate(options));
+        let changes = errors_m.windows(2).map(|pair| (pair[1] - pair[0]).abs());
+        changes.sum::<f64>() / (errors_m.len() - 1) as f64
+    };
+    assert!(4.0 * change_m(&coloured) < change_m(&white));
 }

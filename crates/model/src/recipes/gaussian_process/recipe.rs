@@ -60,7 +60,45 @@ impl Estimator for GaussianProcess {
         epochs: u32,
         phase: &mut Phase<'_, '_>,
     ) -> Result<FittedEncoder, FitError> {
-        fit(rows, context, epochs, phase)
+        let map_rows = map_rows(rows);
+        let unpaired = context.unpaired.iter().map(|own| (own.target, features_of(&own.bounding_box)));
+        let paired = rows.rows.iter().zip(&map_rows.boxes).map(|(row, sides)| (row.target, *sides));
+        let mut boxes: Vec<(u32, [f64; 4])> = paired.chain(unpaired).collect();
+        boxes.sort_by_key(|(target, _)| *target);
+        let upright = context.image_size.and_then(|size| {
+            let size_px = (f64::from(size.width_px()), f64::from(size.height_px()));
+            UprightCamera::new(&boxes, size_px, context.target_height_m)
+        });
+        let bias_sigma_m = context.gnss_bias_sigma_m;
+        let map_settings = FitSettings {
+            bias_sigma_m,
+            white_share: context.noise.correlation.white_share,
+            receiver_m2: (!context.e_gnss_is_estimated).then_some(context.e_gnss_m2),
+            seed: context.seed,
+            upright,
+        };
+        let fitted = fit_map(&map_rows, &map_settings);
+        let Some((predictor, report)) = fitted else {
+            return Err(FitError::Unusable(Error::field(
+                ErrorKind::UnusableSamples,
+                "samples",
+                "they determine no map from boxes to positions; let the target walk through the whole picture",
+            )));
+        };
+        if phase.is_final {
+            note(&report, phase)?;
+        }
+        let receiver_m2 = report.receiver.variance_m2();
+        let e_gnss_m2 = if context.e_gnss_is_estimated { receiver_m2 } else { context.e_gnss_m2 };
+        let mut parts = ModelParts::new(Recipe::GaussianProcess, rows.plane, predictor.features(), e_gnss_m2);
+        predictor.put(&mut parts);
+        put_report(&report, &mut parts);
+        parts.set("boxes_without_fix", context.unpaired.len() as f64);
+        parts.set("unrest_share", white_share(&predictor, &map_rows));
+        if phase.is_final {
+            companion::fit(rows, epochs, &mut parts, phase)?;
+        }
+        Ok(FittedEncoder { parts, covariance: None })
     }
 }
 
@@ -80,57 +118,6 @@ pub(crate) fn target_height_m<'a>(classes: impl Iterator<Item = Option<&'a Targe
         [_, cars] if 2 * cars > all => car.1,
         _ => other.1,
     }
-}
-
-/// Fits the recipe to rows; the final fit also trains the auto-encoder, by that number of epochs.
-///
-/// # Errors
-/// [`FitError::Unusable`] where the rows determine no map.
-fn fit(
-    rows: &TrainingRows,
-    context: &FitContext<'_>,
-    epochs: u32,
-    phase: &mut Phase<'_, '_>,
-) -> Result<FittedEncoder, FitError> {
-    let map_rows = map_rows(rows);
-    let unpaired = context.unpaired.iter().map(|own| (own.target, features_of(&own.bounding_box)));
-    let paired = rows.rows.iter().zip(&map_rows.boxes).map(|(row, sides)| (row.target, *sides));
-    let mut boxes: Vec<(u32, [f64; 4])> = paired.chain(unpaired).collect();
-    boxes.sort_by_key(|(target, _)| *target);
-    let upright = context.image_size.and_then(|size| {
-        let size_px = (f64::from(size.width_px()), f64::from(size.height_px()));
-        UprightCamera::new(&boxes, size_px, context.target_height_m)
-    });
-    let bias_sigma_m = context.gnss_bias_sigma_m;
-    let map_settings = FitSettings {
-        bias_sigma_m,
-        white_share: context.noise.correlation.white_share,
-        receiver_m2: (!context.e_gnss_is_estimated).then_some(context.e_gnss_m2),
-        seed: context.seed,
-        upright,
-    };
-    let fitted = fit_map(&map_rows, &map_settings);
-    let Some((predictor, report)) = fitted else {
-        return Err(FitError::Unusable(Error::field(
-            ErrorKind::UnusableSamples,
-            "samples",
-            "they determine no map from boxes to positions; let the target walk through the whole picture",
-        )));
-    };
-    if phase.is_final {
-        note(&report, phase)?;
-    }
-    let receiver_m2 = report.receiver.variance_m2();
-    let e_gnss_m2 = if context.e_gnss_is_estimated { receiver_m2 } else { context.e_gnss_m2 };
-    let mut parts = ModelParts::new(Recipe::GaussianProcess, rows.plane, predictor.features(), e_gnss_m2);
-    predictor.put(&mut parts);
-    put_report(&report, &mut parts);
-    parts.set("boxes_without_fix", context.unpaired.len() as f64);
-    parts.set("unrest_share", white_share(&predictor, &map_rows));
-    if phase.is_final {
-        companion::fit(rows, epochs, &mut parts, phase)?;
-    }
-    Ok(FittedEncoder { parts, covariance: None })
 }
 
 /// How the receiver's error is correlated beside its bias of the session, and the latter; `None` in the parts of

@@ -15,7 +15,7 @@ use crate::domain::{BoundingBox, FeatureScale, Recipe, Result};
 use crate::encoder::features::{Encoded, features_of};
 use crate::encoder::stored_network::{put_network, take_network};
 use crate::encoder::{Encoder, ErrorContext, Estimate, FittedEncoder};
-use crate::geo::{EastNorth, LocalPlane, Position};
+use crate::geo::{EastNorth, LocalPlane, METRES_PER_DEGREE, Position};
 use crate::network::{Activation, LossSums, LossWeights, Net, NetShape, Schedule, TrainingSet};
 use crate::onnx::answer::{Answer, GraphContext};
 use crate::progress::{FitError, Phase};
@@ -33,8 +33,6 @@ pub(super) static DEFINITION: Definition = Definition {
 
 /// Units per degree.
 const UNITS_PER_DEGREE: f64 = 1e4;
-/// Metres per degree at the equator, for positions outside the range of coordinates.
-const METRES_PER_DEGREE: f64 = 111_320.0;
 /// Hidden units; not specified in the paper.
 const HIDDEN: usize = 32;
 const BATCH: usize = 128;
@@ -236,6 +234,7 @@ fn in_plane(plane: &LocalPlane, units: [f32; 2]) -> EastNorth {
     let in_hemisphere = east_deg.abs() < 90.0;
     match Position::new(wrapped(longitude_deg), origin.latitude_deg() + north_deg) {
         Ok(position) if in_hemisphere => plane.to_plane(position),
+        // Outside the range of coordinates.
         _ => EastNorth { east_m: east_deg * METRES_PER_DEGREE, north_m: north_deg * METRES_PER_DEGREE },
     }
 }

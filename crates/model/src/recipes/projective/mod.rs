@@ -81,49 +81,38 @@ impl Estimator for Variant {
         epochs: u32,
         phase: &mut Phase<'_, '_>,
     ) -> Result<FittedEncoder, FitError> {
-        fit(rows, *self, context.e_gnss_m2, epochs, phase)
+        let form = Form { uses_size: self.uses_size, extra_sigma: RESIDUAL_SIGMA };
+        let mut fitted = projection_fit::fit(&rows.rows, form, &[], &mut subset_rng());
+        let features = scales_of(&fitted.projection);
+        let mut parts = ModelParts::new(Recipe::Projective, rows.plane, features, context.e_gnss_m2);
+        parts.set_position_scale(fitted.projection.centre, fitted.projection.unit_m);
+        let mut residual = None;
+        if self.residual {
+            let (inputs, parameters) = train_residual(rows, &fitted, epochs, phase)?;
+            let net = Net::new(shape(), &parameters);
+            fitted = projection_fit::fit(&rows.rows, form, &hidden_columns(&net, &inputs), &mut subset_rng());
+            put_residual(&mut parts.tensors, &parameters, &fitted.extra);
+            residual = Some(ResidualNetwork { net, weights: fitted.extra.clone() });
+        }
+        let network = residual.as_ref().map(|residual| residual.net.clone());
+        let map = ProjectiveMap {
+            bounds: bounds_of(&fitted.projection, &rows.rows),
+            residual,
+            projection: fitted.projection,
+        };
+        parts.tensors.put_f64("projection", &[COEFFICIENTS], map.projection.coefficients.to_vec());
+        parts.tensors.put_f64("bounds", &[2, 2], map.bounds.into_iter().flatten().collect());
+        let boxes = rows.rows.iter().map(|row| {
+            let position = map.projection.in_units(map.position(&row.bounding_box));
+            (position, map.projection.standardised(&row.bounding_box))
+        });
+        InverseCamera::fit(&boxes.collect::<Vec<_>>()).put(&mut parts.tensors);
+        Ok(FittedEncoder { parts, covariance: Some(GeometricCovariance::new(fitted.covariance, network)) })
     }
 }
 
 fn shape() -> NetShape {
     NetShape::auto_encoder(FEATURE_COUNT, &[RESIDUAL_UNITS], Activation::Tanh)
-}
-
-/// Fits a variant.
-fn fit(
-    rows: &TrainingRows,
-    variant: Variant,
-    e_gnss_m2: f64,
-    epochs: u32,
-    phase: &mut Phase<'_, '_>,
-) -> Result<FittedEncoder, FitError> {
-    let form = Form { uses_size: variant.uses_size, extra_sigma: RESIDUAL_SIGMA };
-    let mut fitted = projection_fit::fit(&rows.rows, form, &[], &mut subset_rng());
-    let features = scales_of(&fitted.projection);
-    let mut parts = ModelParts::new(Recipe::Projective, rows.plane, features, e_gnss_m2);
-    parts.set_position_scale(fitted.projection.centre, fitted.projection.unit_m);
-    let mut residual = None;
-    if variant.residual {
-        let (inputs, parameters) = train_residual(rows, &fitted, epochs, phase)?;
-        let net = Net::new(shape(), &parameters);
-        fitted = projection_fit::fit(&rows.rows, form, &hidden_columns(&net, &inputs), &mut subset_rng());
-        put_residual(&mut parts.tensors, &parameters, &fitted.extra);
-        residual = Some(ResidualNetwork { net, weights: fitted.extra.clone() });
-    }
-    let network = residual.as_ref().map(|residual| residual.net.clone());
-    let map = ProjectiveMap {
-        bounds: bounds_of(&fitted.projection, &rows.rows),
-        residual,
-        projection: fitted.projection,
-    };
-    parts.tensors.put_f64("projection", &[COEFFICIENTS], map.projection.coefficients.to_vec());
-    parts.tensors.put_f64("bounds", &[2, 2], map.bounds.into_iter().flatten().collect());
-    let boxes = rows.rows.iter().map(|row| {
-        let position = map.projection.in_units(map.position(&row.bounding_box));
-        (position, map.projection.standardised(&row.bounding_box))
-    });
-    InverseCamera::fit(&boxes.collect::<Vec<_>>()).put(&mut parts.tensors);
-    Ok(FittedEncoder { parts, covariance: Some(GeometricCovariance::new(fitted.covariance, network)) })
 }
 
 /// Least and greatest value per axis of a position, in units: the range of the labels without the outermost

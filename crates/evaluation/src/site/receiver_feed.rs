@@ -1,0 +1,121 @@
+//! The fixes of a recording on their way to the tracker, and what comes of them.
+
+use std::collections::BTreeMap;
+
+use jiff::{SignedDuration, Timestamp};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
+
+use super::recording::{LabelledBox, RecordedFix, SiteRecording};
+use crate::domain::ReceiverId;
+use crate::fusion::association::{Cancellation, LiveMatchSettings, WorldReceiverWindow};
+use crate::fusion::world::{FrameOutcome, WorldTrackId, WorldTracker};
+
+/// Time between two rounds of matching: that of a service with as many targets.
+const ROUND: SignedDuration = SignedDuration::from_secs(2);
+/// Seed of the sampler.
+const SEED: u64 = 1;
+/// Standard deviation of a fix per axis in the tracker, m: that of a phone.
+const FIX_SIGMA_M: f64 = 2.6;
+
+/// Boxes on tracks with a receiver.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct NamedFigures {
+    /// Boxes on tracks that have a receiver at that instant.
+    pub named: usize,
+    /// Those of them whose target carries it.
+    pub right: usize,
+    /// Boxes of carriers.
+    pub carried: usize,
+}
+
+impl NamedFigures {
+    /// These and others together.
+    #[must_use]
+    pub const fn plus(self, other: Self) -> Self {
+        Self {
+            named: self.named + other.named,
+            right: self.right + other.right,
+            carried: self.carried + other.carried,
+        }
+    }
+
+    /// Share of the boxes on tracks with a receiver whose target carries it.
+    #[must_use]
+    pub fn right_share(&self) -> f64 {
+        self.right as f64 / self.named.max(1) as f64
+    }
+
+    /// Share of the carriers' boxes on tracks with their receiver.
+    #[must_use]
+    pub fn found_share(&self) -> f64 {
+        self.right as f64 / self.carried.max(1) as f64
+    }
+}
+
+/// Feeds the fixes of a recording to its tracker in the order of time.
+pub(super) struct ReceiverFeed<'a> {
+    recording: &'a SiteRecording,
+    /// Fixes that are yet to come, in the order of time.
+    rest: &'a [RecordedFix],
+    carriers: BTreeMap<&'a ReceiverId, usize>,
+    window: WorldReceiverWindow,
+    next_round: Option<Timestamp>,
+    figures: NamedFigures,
+}
+
+impl<'a> ReceiverFeed<'a> {
+    pub(super) fn new(recording: &'a SiteRecording) -> Self {
+        Self {
+            recording,
+            rest: &recording.fixes,
+            carriers: recording.receivers.iter().map(|(id, target)| (id, *target)).collect(),
+            window: WorldReceiverWindow::new(LiveMatchSettings::of_site()),
+            next_round: None,
+            figures: NamedFigures::default(),
+        }
+    }
+
+    /// Feeds the fixes until an instant, and matches if it is time for it.
+    pub(super) fn advance(&mut self, tracker: &mut WorldTracker, time: Timestamp) {
+        let (now, rest) = self.rest.split_at(self.rest.partition_point(|fix| fix.time <= time));
+        self.rest = rest;
+        for fix in now {
+            let receiver = &self.recording.receivers[fix.receiver].0;
+            self.window.observe_fix(receiver, fix.time, fix.position, None);
+            tracker.observe_fix(receiver, fix.time, fix.position, FIX_SIGMA_M);
+        }
+        if self.next_round.is_none_or(|next| time >= next) {
+            self.next_round = time.checked_add(ROUND).ok();
+            let mut random = ChaCha8Rng::seed_from_u64(SEED);
+            if let Ok(matched) = self.window.matched(&mut random, Cancellation::NEVER) {
+                self.window.accept(matched);
+                tracker.set_receiver_matches(self.window.receivers());
+            }
+        }
+    }
+
+    /// Counts the boxes of a frame, and takes its tracks for the next round.
+    pub(super) fn observe(&mut self, tracker: &WorldTracker, outcome: &FrameOutcome, boxes: &[&LabelledBox]) {
+        self.window.observe(tracker, outcome);
+        for (labelled, track) in boxes.iter().zip(&outcome.tracks) {
+            let carrier = track.and_then(|track| self.carrier_of(tracker, track));
+            let is_carrier = |target: &usize| self.carriers.values().any(|carrier| carrier == target);
+            self.figures = self.figures.plus(NamedFigures {
+                named: usize::from(carrier.is_some()),
+                right: usize::from(carrier.is_some() && carrier == labelled.target),
+                carried: usize::from(labelled.target.as_ref().is_some_and(is_carrier)),
+            });
+        }
+    }
+
+    /// The target that carries the receiver of a track.
+    fn carrier_of(&self, tracker: &WorldTracker, track: WorldTrackId) -> Option<usize> {
+        self.carriers.get(&tracker.track(track)?.receiver_match()?.receiver_id).copied()
+    }
+
+    pub(super) fn figures(self) -> NamedFigures {
+        self.figures
+    }
+}

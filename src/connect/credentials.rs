@@ -1,6 +1,7 @@
 //! The credentials that open a connection, and the reasons why it does not open.
 
-use crate::exchange::{SaslMechanism, Secrets};
+use crate::exchange::Secrets;
+use crate::exchange::kinds::{Login, SaslMechanism};
 
 /// Why a connection does not work now; it is opened again.
 #[derive(Debug, thiserror::Error)]
@@ -32,4 +33,18 @@ pub(super) struct Credentials<'a> {
     pub(super) sasl_mechanism: Option<SaslMechanism>,
     pub(super) ca_certificate: Option<&'a str>,
     pub(super) secrets: &'a Secrets,
+}
+
+impl<'a> Credentials<'a> {
+    /// Those of a user.
+    pub(super) fn of(login: &'a Login, secrets: &'a Secrets) -> Self {
+        let Login { username, ca_certificate } = login;
+        Self { username: username.as_deref(), ..Self::trusting(ca_certificate.as_ref(), secrets) }
+    }
+
+    /// Those towards a peer without users, whose certificate is of that authority.
+    pub(super) fn trusting(ca_certificate: Option<&'a String>, secrets: &'a Secrets) -> Self {
+        let ca_certificate = ca_certificate.map(String::as_str);
+        Self { username: None, sasl_mechanism: None, ca_certificate, secrets }
+    }
 }

@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use super::credentials::PeerError;
-use super::open;
+use super::kinds;
 use super::sink::Outcomes;
 use crate::app::{App, ConnectionLease, ConnectionState, LastMessage, LiveConnection};
 use crate::domain::{ConnectionId, ConnectionKey, OutboxMessage};
@@ -45,7 +45,7 @@ impl Delivery<'_> {
     pub(super) async fn run(&self, attempt: &Attempt) -> Result<Infallible, PeerError> {
         let clock = &self.app.clock;
         let mut sink =
-            open::sink(self.app, self.id, self.settings, self.secrets, (self.client_id, true)).await?;
+            kinds::sink(self.app, self.id, self.settings, self.secrets, (self.client_id, true)).await?;
         // A sink that is seen running misses no position of this process's cameras.
         let _ = tokio::time::timeout(PUBLISHER_WAIT, self.live.publishing.wait()).await;
         self.live.enter(ConnectionState::Running, clock.now());

@@ -157,7 +157,7 @@ impl Intake {
     /// A failure that is not the message's fault, so the message must come again.
     pub(super) async fn take(&mut self, message: Message) -> Result<(), PeerError> {
         let now = self.app.clock.now();
-        let time_bounds = self.app.live_time_bounds(now);
+        let time_bounds = self.app.limits.live_time_bounds(now);
         let context = MessageContext { subject: &message.subject, received_at: now, time_bounds };
         let content = message.content(self.app.limits.connection_message_bytes);
         let read = content.and_then(|content| self.decoder.decode(content, &context));
@@ -296,9 +296,9 @@ async fn open_stream(
 ) -> Result<LiveStream> {
     let until = app.clock.monotonic() + OWNING_TIME;
     loop {
-        match app.open_stream(camera, name, ClientId::UNKNOWN, last_seq, durability).await {
+        match LiveStream::open(app, camera, name, ClientId::UNKNOWN, last_seq, durability).await {
             Err(error) if is_elsewhere(error.kind()) && app.clock.monotonic() < until => {
-                app.want_camera(camera).await?;
+                app.nodes().want_camera(camera).await?;
                 tokio::time::sleep(OWNING_PAUSE).await;
             }
             opened => return opened,
@@ -482,9 +482,13 @@ pub(super) fn describe(item: &MessageItem) -> String {
                 DetectedBox::Pixels(edges) => ("px", edges),
                 DetectedBox::Fractions(edges) => ("of the image", edges),
             };
+            let camera = match detection.camera.as_str() {
+                "" => String::new(),
+                camera => format!(" of `{camera}`"),
+            };
             format!(
-                "object {} of `{}` at {}: box {left}, {top} to {right}, {bottom} {name}",
-                detection.target_id, detection.camera, detection.time
+                "object {}{camera} at {}: box {left}, {top} to {right}, {bottom} {name}",
+                detection.target_id, detection.time
             )
         }
         MessageItem::Fix(fix) => {

@@ -13,32 +13,18 @@
 
 mod credentials;
 mod deliver;
-mod file;
 mod inbox;
 mod intake;
-mod kafka;
-mod line_reader;
-mod lines;
-mod listener;
-mod mqtt;
-mod mqtt_client;
-mod nats;
-mod open;
+mod kinds;
 mod peer;
 mod publish;
-mod push;
-mod rtsp;
-mod serial;
 mod sign_in;
 mod sink;
 mod snapshot;
 mod source;
-mod stream;
 mod supervisor;
 mod tls;
 mod trial;
-mod udp;
-mod webhook;
 
 pub use snapshot::fetch_snapshot;
 pub use supervisor::Supervisor;

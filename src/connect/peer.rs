@@ -19,13 +19,12 @@ pub(super) const OPEN_TIME: Duration = Duration::from_secs(10);
 pub(super) trait ByteStream: AsyncRead + AsyncWrite + Send + Unpin {}
 impl<S: AsyncRead + AsyncWrite + Send + Unpin> ByteStream for S {}
 
-/// Opens a TCP connection, encrypted if asked for.
+/// Opens a TCP connection, encrypted if the address is.
 pub(super) async fn connect(
     address: &Address,
-    is_encrypted: bool,
     credentials: &Credentials<'_>,
 ) -> Result<Box<dyn ByteStream>, PeerError> {
-    let tls = is_encrypted.then(|| tls::peer_config(credentials)).transpose()?;
+    let tls = address.is_encrypted.then(|| tls::peer_config(credentials)).transpose()?;
     dial(&address.host, address.port, tls).await
 }
 
@@ -36,15 +35,30 @@ pub(super) async fn dial(
     tls: Option<Arc<ClientConfig>>,
 ) -> Result<Box<dyn ByteStream>, PeerError> {
     let open = async {
-        let stream = TcpStream::connect((host, port)).await?;
-        stream.set_nodelay(true)?;
-        let Some(tls) = tls else {
-            return Ok(Box::new(stream) as Box<dyn ByteStream>);
-        };
-        let name = tls::server_name(host)?;
-        Ok(Box::new(TlsConnector::from(tls).connect(name, stream).await?) as Box<dyn ByteStream>)
+        let stream = tcp(host, port).await?;
+        match tls {
+            Some(tls) => encrypt(stream, host, tls).await,
+            None => Ok(Box::new(stream) as Box<dyn ByteStream>),
+        }
     };
     within(OPEN_TIME, open).await
+}
+
+/// Opens a TCP connection to a port of a host.
+pub(super) async fn tcp(host: &str, port: u16) -> Result<TcpStream, PeerError> {
+    let stream = TcpStream::connect((host, port)).await?;
+    stream.set_nodelay(true)?;
+    Ok(stream)
+}
+
+/// Begins TLS with a host.
+pub(super) async fn encrypt(
+    stream: TcpStream,
+    host: &str,
+    tls: Arc<ClientConfig>,
+) -> Result<Box<dyn ByteStream>, PeerError> {
+    let name = tls::server_name(host)?;
+    Ok(Box::new(TlsConnector::from(tls).connect(name, stream).await?))
 }
 
 /// The work, or an error when it takes longer.

@@ -8,6 +8,7 @@ use uuid::Builder;
 
 use crate::app::{App, LiveConnection, SinkFeed, SinkPosition};
 use crate::domain::{ConnectionKey, Observation, OutboxMessage, TargetId};
+use crate::exchange::kinds::Topic;
 use crate::exchange::{
     OutgoingFormat, OutgoingPosition, SinkSettings, cot_event, home_assistant_attributes, onvif_frame,
     position_json,
@@ -27,12 +28,17 @@ pub(super) struct Publisher<'a> {
     pub(super) app: &'a App,
     pub(super) key: ConnectionKey,
     pub(super) settings: &'a SinkSettings,
+    pub(super) topic: Topic,
     pub(super) live: &'a Arc<LiveConnection>,
 }
 
 impl Publisher<'_> {
     pub(super) async fn run(self) {
-        let Some(feed) = self.app.sink_feeds.of(self.key) else { return };
+        let Some(feed) = self.app.sink_feeds.of(self.key) else {
+            // The events of places come to the outbox with their own transaction.
+            let _ = self.live.publishing.set(());
+            return std::future::pending().await;
+        };
         // The database first learns of the log, so that it is known if this process ends too soon.
         self.store(&[]).await;
         // Set before, where the settings have changed since.
@@ -51,8 +57,10 @@ impl Publisher<'_> {
     /// Brings the oldest positions into the outbox. Where that is interrupted, they are still the oldest.
     async fn publish(&self, feed: &SinkFeed) {
         let positions = feed.oldest(MAX_BATCH);
-        let sent = positions.iter().filter(|position| self.takes(position));
-        let messages: Vec<_> = sent.map(|position| self.message(position)).collect();
+        let messages: Vec<_> = positions
+            .iter()
+            .filter_map(|position| Some(self.message(position, &self.target(position)?)))
+            .collect();
         self.store(&messages).await;
         let lost = feed.take_lost();
         self.live.update(|status| {
@@ -63,18 +71,21 @@ impl Publisher<'_> {
         self.live.queued.notify_one();
     }
 
-    /// Home Assistant keeps every device that it was told of, so it gets no target that a tracker's number names.
-    fn takes(&self, position: &SinkPosition) -> bool {
-        let number = position.observation.tracker_id().map(TargetId::from);
-        self.settings.format != OutgoingFormat::HomeAssistant
-            || number.as_ref() != Some(&position.point.target_id)
+    /// The target of a position; `None` for one that the sink is not to have. Home Assistant keeps every device that it was
+    /// told of, so a target that only a tracker's number names is the device of its receiver, or none.
+    fn target(&self, SinkPosition { observation, point, .. }: &SinkPosition) -> Option<TargetId> {
+        let has_name = observation.tracker_id().is_none();
+        if has_name || self.settings.format != OutgoingFormat::HomeAssistant {
+            return Some(point.target_id.clone());
+        }
+        point.receiver_match.as_ref().map(|own| TargetId::from(own.receiver_id.clone()))
     }
 
     /// Appends messages, again and again until the outbox has them.
     async fn store(&self, messages: &[OutboxMessage]) {
         let mut is_first = true;
         loop {
-            match self.app.append_to_outbox(self.key, messages).await {
+            match self.app.outboxes().append(self.key, messages).await {
                 Ok(dropped) => return self.live.update(|status| status.dropped += dropped),
                 Err(error) => {
                     if std::mem::take(&mut is_first) {
@@ -89,13 +100,14 @@ impl Publisher<'_> {
         }
     }
 
-    fn message(&self, position: &SinkPosition) -> OutboxMessage {
+    fn message(&self, position: &SinkPosition, target_id: &TargetId) -> OutboxMessage {
         let SinkPosition { number, camera, point, .. } = position;
         let message_id = message_id(self.key, position);
         let outgoing = OutgoingPosition {
             message_id: &message_id,
             camera_id: camera,
-            target_id: &point.target_id,
+            target_id,
+            receiver_match: point.receiver_match.as_ref(),
             time: point.state.time,
             position: point.position,
             covariance: point.state.normal_covariance(),
@@ -104,7 +116,7 @@ impl Publisher<'_> {
         };
         OutboxMessage {
             number: number.cast_signed(),
-            subject: self.settings.topic_of(camera, &point.target_id),
+            subject: self.topic.of(camera, target_id),
             payload: payload(self.settings, &outgoing),
             created_at: self.app.clock.now(),
             message_id,

@@ -14,7 +14,7 @@ use super::peer::{OPEN_TIME, connect, within};
 use super::sign_in::SignIn;
 use crate::app::App;
 use crate::domain::{CameraId, Error, ErrorKind, Picture, PictureFormat, Result, SnapshotSource};
-use crate::exchange::{Address, OnvifRequest, SOAP, Scheme, Secrets, bracketed};
+use crate::exchange::{Address, OnvifRequest, SOAP, Secrets, bracketed};
 
 /// Largest document of an ONVIF device, bytes.
 const DOCUMENT_BYTES: usize = 1024 * 1024;
@@ -22,14 +22,14 @@ const DOCUMENT_BYTES: usize = 1024 * 1024;
 /// Fetches a picture from the snapshot address of a camera, stores it, and gives it back. Redirects are not followed.
 ///
 /// # Errors
-/// As [`App::begin_snapshot`] and [`App::set_picture`]; `SnapshotUnavailable` if the address gives no JPEG or PNG of at
+/// As [`begin_snapshot`](crate::app::Pictures::begin_snapshot) and [`set`](crate::app::Pictures::set) of pictures; `SnapshotUnavailable` if the address gives no JPEG or PNG of at
 /// most `limits.picture_bytes` within ten seconds.
 pub async fn fetch_snapshot(app: &App, id: &CameraId) -> Result<Picture> {
-    let source = app.begin_snapshot(id).await?;
+    let source = app.pictures().begin_snapshot(id).await?;
     let fetched = within(OPEN_TIME, fetch(&source, app.limits.picture_bytes)).await;
     let picture =
         fetched.map_err(|error| Error::refused(ErrorKind::SnapshotUnavailable, error.to_string()))?;
-    app.set_picture(id, Some(&picture)).await?;
+    app.pictures().set(id, Some(&picture)).await?;
     Ok(picture)
 }
 
@@ -86,9 +86,7 @@ impl Camera {
         request: Request<Full<Bytes>>,
     ) -> Result<(Response<Incoming>, AbortOnDropHandle<()>), PeerError> {
         let secrets = Secrets::default();
-        let credentials =
-            Credentials { username: None, sasl_mechanism: None, ca_certificate: None, secrets: &secrets };
-        let stream = connect(&self.address, self.address.scheme == Scheme::Https, &credentials).await?;
+        let stream = connect(&self.address, &Credentials::trusting(None, &secrets)).await?;
         let broken = |error: hyper::Error| PeerError(error.to_string());
         let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await.map_err(broken)?;
         let connection = AbortOnDropHandle::new(tokio::spawn(async move { drop(connection.await) }));

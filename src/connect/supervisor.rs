@@ -19,15 +19,16 @@ use tokio_util::task::TaskTracker;
 use super::credentials::PeerError;
 use super::deliver::{Attempt, Delivery};
 use super::intake::Intake;
-use super::open;
+use super::kinds;
 use super::publish::Publisher;
 use super::source::SourceIdentity;
 use crate::app::{
-    App, ConnectionLease, ConnectionState, LiveConnection, ReportedStatuses, WantedPositions,
+    App, ConnectionLease, ConnectionState, LiveConnection, ReportedStatuses, WantedEvents, WantedPositions,
     connection_groups, connection_settings,
 };
 use crate::backoff::Backoff;
-use crate::domain::{CameraId, Connection, ConnectionId, ConnectionKey, Result, Revision};
+use crate::domain::{CameraId, Connection, ConnectionId, ConnectionKey, Result, Revision, TrackScope};
+use crate::exchange::kinds::SinkContent;
 use crate::exchange::{ConnectionSettings, Secrets, SourceSettings};
 use crate::shutdown::Shutdown;
 
@@ -145,21 +146,21 @@ impl Supervisor {
         let site_of = |camera: &CameraId| self.app.registry.get(camera).and_then(|known| known.site.clone());
         let keyed = active.iter().map(|active| (active.connection.key, &active.settings));
         let groups = connection_groups(keyed, site_of);
-        let leases = self.app.own_connections(&groups).await?;
+        let leases = self.app.nodes().own_connections(&groups).await?;
         self.adjust(active.into_iter().flat_map(|active| wanted_tasks(active, &leases)).collect());
-        self.app.report_connections(&mut self.reported).await
+        self.app.connections().report(&mut self.reported).await
     }
 
     /// Counts what processes may have lost that ended before their positions were in the outboxes.
     async fn count_lost(&self, connections: &[Connection]) -> Result<()> {
-        for key in self.app.lost_outbox_logs().await? {
+        for key in self.app.outboxes().lost_logs().await? {
             let Some(connection) = connections.iter().find(|connection| connection.key == key) else {
                 continue;
             };
             let message = "a server ended before its last positions were queued; some may be missing";
             tracing::warn!(connection = %connection.id(), message);
             let error = Some((self.app.clock.now(), message.to_owned()));
-            self.app.live_connection(connection).update(|status| {
+            self.app.connections().live(connection).update(|status| {
                 // The number of positions is not known.
                 status.dropped += 1;
                 status.last_error = error;
@@ -173,13 +174,23 @@ impl Supervisor {
         if self.fed == all {
             return;
         }
-        let wanted = active.iter().filter_map(|active| {
-            let (key, sink) = (active.connection.key, active.settings.sink.as_ref()?);
+        let sinks = || {
+            active.iter().filter_map(|active| Some((active.connection.key, active.settings.sink.as_ref()?)))
+        };
+        let wanted = sinks().filter(|(_, sink)| sink.content == SinkContent::Positions);
+        let wanted = wanted.filter_map(|(key, sink)| {
             let min_interval_s = sink.min_interval_s.unwrap_or(DEFAULT_INTERVAL_S);
             Some(WantedPositions { key, cameras: sink.cameras().ok()?, min_interval_s })
         });
         let wanted: Vec<_> = wanted.collect();
-        self.app.sink_feeds.feed(&all.iter().map(|(key, _)| *key).collect(), &wanted);
+        let of_events = sinks().filter(|(_, sink)| sink.content == SinkContent::PlaceEvents);
+        let of_events = of_events.filter_map(|(key, sink)| {
+            let cameras = sink.cameras().ok()?.into_iter().map(TrackScope::Camera);
+            let scopes = cameras.chain(sink.sites().ok()?.into_iter().map(TrackScope::Site)).collect();
+            Some(WantedEvents { key, scopes, topic: sink.topic().ok()? })
+        });
+        let of_events = of_events.collect();
+        self.app.sink_feeds.feed(&all.iter().map(|(key, _)| *key).collect(), &wanted, of_events);
         self.fed = all;
     }
 
@@ -234,7 +245,7 @@ impl WantedTask {
 async fn all_connections(app: &App) -> Result<Vec<Connection>> {
     let mut connections: Vec<Connection> = Vec::new();
     loop {
-        let page = app.connections(connections.last().map(Connection::id), PAGE).await?;
+        let page = app.connections().list(connections.last().map(Connection::id), PAGE).await?;
         connections.extend(page.items);
         if page.next.is_none() {
             return Ok(connections);
@@ -259,7 +270,7 @@ async fn run_task(app: App, task: WantedTask, before: Option<JoinHandle<()>>, ca
         // A task that panicked has ended, too.
         let _ = before.await;
     }
-    let live = app.live_connection(&task.active.connection);
+    let live = app.connections().live(&task.active.connection);
     tokio::select! {
         () = cancel.cancelled() => {}
         () = task.lease.ended(&app.clock) => {}
@@ -277,7 +288,9 @@ async fn run_part(app: &App, task: &WantedTask, live: &Arc<LiveConnection>) {
             retried(app, connection, live, Work::Source { settings, secrets }).await;
         }
         (Part::Publisher, _, Some(settings)) => {
-            Publisher { app, key: connection.key, settings, live }.run().await;
+            // What is wrong with settings is shown by the delivery.
+            let Ok(topic) = settings.topic() else { return };
+            Publisher { app, key: connection.key, settings, topic, live }.run().await;
         }
         (Part::Delivery, _, Some(settings)) => {
             let client_id = client_id(connection);
@@ -350,7 +363,7 @@ async fn run_source(
     attempt: &Attempt,
 ) -> Result<Infallible, PeerError> {
     let identity = SourceIdentity { client_id: client_id(connection), is_lasting: true };
-    let mut source = open::source(app, connection, settings, secrets, &identity, live).await?;
+    let mut source = kinds::source(app, connection, settings, secrets, &identity, live).await?;
     let mut intake = Intake::new(app.clone(), connection.id().clone(), live.clone(), settings)?;
     live.enter(ConnectionState::Running, app.clock.now());
     live.update(|status| status.connects += 1);

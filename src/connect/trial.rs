@@ -4,16 +4,18 @@ use std::time::Duration;
 
 use super::credentials::PeerError;
 use super::intake::describe;
-use super::open;
+use super::kinds;
 use super::publish::payload;
 use super::sink::Outcomes;
 use super::source::{Settled, SourceIdentity};
 use crate::app::{App, ConnectionState, LastMessage, connection_settings};
 use crate::domain::{CameraId, Connection, OutboxMessage, Result, TargetId};
+use crate::exchange::kinds::SinkContent;
 use crate::exchange::{
     MessageContext, OutgoingPosition, Secrets, SinkSettings, SourceSettings, source_decoder,
 };
 use crate::geo::{PlaneCovariance, Position};
+use crate::places::settings::EventKind;
 
 /// How often the status of a running source is looked at.
 const WATCH_EVERY: Duration = Duration::from_millis(100);
@@ -60,7 +62,7 @@ async fn watch(app: &App, connection: &Connection, wait: Duration) -> Result<Opt
     let until = app.clock.monotonic() + wait;
     loop {
         // Another node may run it.
-        let (status, ..) = app.connection_status(connection).await?;
+        let (status, ..) = app.connections().status(connection).await?;
         let is_last = app.clock.monotonic() >= until;
         match (status.last_message, status.last_error) {
             (Some(message), _) => return Ok(Some(message)),
@@ -84,11 +86,11 @@ async fn try_source(
         client_id: format!("sightfix-{}-test-{random}", connection.id()),
         is_lasting: false,
     };
-    let live = app.live_connection(connection);
-    let mut source = open::source(app, connection, settings, secrets, &identity, &live).await?;
+    let live = app.connections().live(connection);
+    let mut source = kinds::source(app, connection, settings, secrets, &identity, &live).await?;
     let message = source.next().await?;
     let now = app.clock.now();
-    let time_bounds = app.live_time_bounds(now);
+    let time_bounds = app.limits.live_time_bounds(now);
     let context = MessageContext { subject: &message.subject, received_at: now, time_bounds };
     let content = message.content(app.limits.connection_message_bytes);
     let reading = match content.and_then(|content| source_decoder(settings).decode(content, &context)) {
@@ -112,15 +114,17 @@ async fn try_sink(
     let now = app.clock.now();
     let random = app.randomness.uuid_v7(now);
     let client_id = format!("sightfix-{}-test-{}", connection.id(), random.simple());
-    let mut sink = open::sink(app, connection.id(), settings, secrets, (&client_id, false)).await?;
+    let mut sink = kinds::sink(app, connection.id(), settings, secrets, (&client_id, false)).await?;
     let cameras = settings.cameras()?;
-    let camera: &CameraId = cameras.first().ok_or_else(|| PeerError::from("the sink names no camera"))?;
+    // A sink of events may name sites alone.
+    let camera = &cameras.first().cloned().map_or_else(|| CameraId::new(TEST_TARGET), Ok)?;
     let target = TargetId::new(TEST_TARGET)?;
     let message_id = random.to_string();
     let position = OutgoingPosition {
         message_id: &message_id,
         camera_id: camera,
         target_id: &target,
+        receiver_match: None,
         time: now,
         position: Position::new(0.0, 0.0).map_err(|error| PeerError(error.to_string()))?,
         covariance: PlaneCovariance::isotropic(1.0),
@@ -129,7 +133,10 @@ async fn try_sink(
     };
     let message = OutboxMessage {
         number: 0,
-        subject: settings.topic_of(camera, &target),
+        subject: match settings.content {
+            SinkContent::Positions => settings.topic()?.of(camera, &target),
+            SinkContent::PlaceEvents => settings.topic()?.of_event(TEST_TARGET, EventKind::Enter.as_str()),
+        },
         payload: payload(settings, &position),
         created_at: now,
         message_id,

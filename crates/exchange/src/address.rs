@@ -7,134 +7,83 @@ use crate::domain::{Error, Result, check_text};
 /// Longest address, bytes.
 const MAX_ADDRESS_BYTES: usize = 512;
 
-/// The part of an address before the host.
+/// The part of an address before the host, and what follows it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Scheme {
+    name: &'static str,
+    form: Form,
+    is_encrypted: bool,
+}
+
+/// The text after the name of a scheme.
+#[derive(Debug, Clone, Copy)]
+enum Form {
+    /// Nothing.
+    Bare,
+    /// The path of a device.
+    Device,
+    /// A host with its port, or the default one.
+    Host { default_port: Option<u16>, rest: Rest },
+}
+
+/// The text after a host and its port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[expect(missing_docs, reason = "each is the scheme of its name")]
-pub enum Scheme {
-    Mqtt,
-    Mqtts,
-    Tcp,
-    Tls,
-    TcpListen,
-    Udp,
-    Gpsd,
-    Rtsp,
-    Rtsps,
-    Push,
-    Http,
-    Https,
-    Nats,
-    Kafka,
-    Kafkas,
-    Serial,
-    File,
+enum Rest {
+    Nothing,
+    Path,
+    Hosts,
 }
 
 impl Scheme {
-    pub(super) const SOURCES: &[Self] = &[
-        Self::Mqtt,
-        Self::Mqtts,
-        Self::Kafka,
-        Self::Kafkas,
-        Self::Tcp,
-        Self::Tls,
-        Self::TcpListen,
-        Self::Udp,
-        Self::Serial,
-        Self::Gpsd,
-        Self::Rtsp,
-        Self::Rtsps,
-        Self::Push,
-    ];
-    pub(super) const SINKS: &[Self] = &[
-        Self::Mqtt,
-        Self::Mqtts,
-        Self::Kafka,
-        Self::Kafkas,
-        Self::Nats,
-        Self::Tcp,
-        Self::Tls,
-        Self::Udp,
-        Self::Http,
-        Self::Https,
-        Self::File,
-    ];
-    /// The schemes that are complete without an address.
-    const BARE: [Self; 2] = [Self::Push, Self::File];
-    /// Kinds whose messages have topics that are subscribed to.
-    const SUBSCRIBED: [Self; 4] = [Self::Mqtt, Self::Mqtts, Self::Kafka, Self::Kafkas];
+    /// A scheme that is a complete address.
+    pub(crate) const fn bare(name: &'static str) -> Self {
+        Self { name, form: Form::Bare, is_encrypted: false }
+    }
 
-    const fn as_str(self) -> &'static str {
-        match self {
-            Self::Mqtt => "mqtt",
-            Self::Mqtts => "mqtts",
-            Self::Tcp => "tcp",
-            Self::Tls => "tls",
-            Self::TcpListen => "tcp-listen",
-            Self::Udp => "udp",
-            Self::Gpsd => "gpsd",
-            Self::Rtsp => "rtsp",
-            Self::Rtsps => "rtsps",
-            Self::Push => "push",
-            Self::Http => "http",
-            Self::Https => "https",
-            Self::Nats => "nats",
-            Self::Kafka => "kafka",
-            Self::Kafkas => "kafkas",
-            Self::Serial => "serial",
-            Self::File => "file",
+    /// The scheme of a device of this machine.
+    pub(crate) const fn device(name: &'static str) -> Self {
+        Self { name, form: Form::Device, is_encrypted: false }
+    }
+
+    /// A scheme of `HOST:PORT`, where the port may be left out if there is a default.
+    pub(crate) const fn host(name: &'static str, default_port: Option<u16>) -> Self {
+        Self { name, form: Form::Host { default_port, rest: Rest::Nothing }, is_encrypted: false }
+    }
+
+    /// A scheme of `HOST[:PORT]/PATH`.
+    pub(crate) const fn url(name: &'static str, default_port: u16) -> Self {
+        let form = Form::Host { default_port: Some(default_port), rest: Rest::Path };
+        Self { name, form, is_encrypted: false }
+    }
+
+    /// A scheme of several `HOST[:PORT]` with commas between them.
+    pub(crate) const fn hosts(name: &'static str, default_port: u16) -> Self {
+        let form = Form::Host { default_port: Some(default_port), rest: Rest::Hosts };
+        Self { name, form, is_encrypted: false }
+    }
+
+    /// The same with TLS.
+    pub(crate) const fn encrypted(self) -> Self {
+        Self { is_encrypted: true, ..self }
+    }
+
+    /// The text after its name, if an address has this scheme.
+    fn rest_of<'a>(&self, text: &'a str) -> Option<&'a str> {
+        let rest = text.strip_prefix(self.name)?.strip_prefix(':')?;
+        match self.form {
+            Form::Bare => rest.is_empty().then_some(rest),
+            Form::Device | Form::Host { .. } => rest.strip_prefix("//"),
         }
-    }
-
-    const fn default_port(self) -> Option<u16> {
-        match self {
-            Self::Mqtt => Some(1883),
-            Self::Mqtts => Some(8883),
-            Self::Gpsd => Some(2947),
-            Self::Rtsp => Some(554),
-            Self::Rtsps => Some(322),
-            Self::Http => Some(80),
-            Self::Https => Some(443),
-            Self::Nats => Some(4222),
-            Self::Kafka => Some(9092),
-            Self::Kafkas => Some(9093),
-            Self::Tcp | Self::Tls | Self::TcpListen | Self::Udp | Self::Push | Self::Serial | Self::File => {
-                None
-            }
-        }
-    }
-
-    /// True if a source of this kind subscribes to topics.
-    pub(super) fn subscribes(self) -> bool {
-        Self::SUBSCRIBED.contains(&self)
-    }
-
-    /// True if it is MQTT, plain or encrypted.
-    pub(super) const fn is_mqtt(self) -> bool {
-        matches!(self, Self::Mqtt | Self::Mqtts)
-    }
-
-    /// True if it is RTSP, plain or encrypted.
-    pub(super) const fn is_rtsp(self) -> bool {
-        matches!(self, Self::Rtsp | Self::Rtsps)
-    }
-
-    /// True if an address of this kind goes on after the port.
-    const fn has_path(self) -> bool {
-        self.is_rtsp() || matches!(self, Self::Http | Self::Https)
-    }
-
-    /// True if it is Kafka, plain or encrypted.
-    pub(super) const fn is_kafka(self) -> bool {
-        matches!(self, Self::Kafka | Self::Kafkas)
     }
 }
 
 /// Where a peer is.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Address {
-    /// How it is reached.
-    pub scheme: Scheme,
+    /// How it is reached: the part before the colon.
+    pub scheme: &'static str,
+    /// True if the scheme is one with TLS.
+    pub is_encrypted: bool,
     /// Name or address of its machine; without the brackets of IPv6.
     pub host: String,
     /// The port of that host.
@@ -152,93 +101,56 @@ pub fn bracketed(host: &str) -> Cow<'_, str> {
 }
 
 impl Address {
-    /// Reads an address of HTTP or HTTPS.
+    /// Reads an address by one of these schemes; with the value that belongs to it.
     ///
     /// # Errors
     /// `InvalidArgument` naming `address`.
-    pub fn of_http(text: &str) -> Result<Self> {
-        Self::parse(text, &[Scheme::Http, Scheme::Https])
+    pub(crate) fn parse<T: Copy>(text: &str, kinds: &[(&'static [Scheme], T)]) -> Result<(Self, T)> {
+        check_text("address", text, MAX_ADDRESS_BYTES)?;
+        let mut schemes = kinds.iter().flat_map(|(schemes, kind)| schemes.iter().map(move |it| (it, *kind)));
+        let found = schemes.find_map(|(scheme, kind)| Some((scheme, scheme.rest_of(text)?, kind)));
+        let Some((scheme, rest, kind)) = found else {
+            let schemes = kinds.iter().flat_map(|(schemes, _)| schemes.iter());
+            let known: Vec<String> = schemes.map(|it| format!("{}:", it.name)).collect();
+            return Err(invalid(&format!("must begin with one of {}", known.join(", "))));
+        };
+        Ok((Self::after_scheme(*scheme, rest)?, kind))
     }
 
-    /// Reads an address of one of these schemes.
-    ///
-    /// # Errors
-    /// `InvalidArgument` naming `address`.
-    pub(super) fn parse(text: &str, schemes: &[Scheme]) -> Result<Self> {
-        let invalid = |message: String| Error::invalid("address", message);
-        check_text("address", text, MAX_ADDRESS_BYTES)?;
-        let mut bare = Scheme::BARE.into_iter().filter(|scheme| schemes.contains(scheme));
-        if let Some(scheme) = bare.find(|scheme| text == format!("{}:", scheme.as_str())) {
-            return Ok(Self::without_host(scheme, String::new()));
-        }
-        let named = text.split_once("://").and_then(|(name, rest)| {
-            Some((
-                schemes.iter().copied().find(|it| it.as_str() == name && !Scheme::BARE.contains(it))?,
-                rest,
-            ))
-        });
-        let Some((scheme, rest)) = named else {
-            let known: Vec<String> = schemes.iter().map(|it| format!("{}:", it.as_str())).collect();
-            return Err(invalid(format!("must begin with one of {}", known.join(", "))));
+    fn after_scheme(scheme: Scheme, text: &str) -> Result<Self> {
+        let Scheme { name, form, is_encrypted } = scheme;
+        let Form::Host { default_port, rest } = form else {
+            let (host, path, others) = (String::new(), text.to_owned(), Vec::new());
+            return Ok(Self { scheme: name, is_encrypted, host, port: 0, others, path });
         };
-        if scheme == Scheme::Serial {
-            let address = Self::without_host(scheme, rest.to_owned());
-            return address.serial_line().map(|_| address);
-        }
-        let (authority, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
+        let (authority, path) = text.split_at(text.find('/').unwrap_or(text.len()));
         if authority.contains('@') {
-            return Err(invalid("must not contain a user; give username and the secret password".to_owned()));
+            return Err(invalid("must not contain a user; give username and the secret password"));
         }
-        if !scheme.has_path() && !matches!(path, "" | "/") {
-            return Err(invalid("must end after the port".to_owned()));
+        if rest != Rest::Path && !matches!(path, "" | "/") {
+            return Err(invalid("must end after the port"));
         }
         if path.contains(|it: char| it.is_whitespace() || !it.is_ascii()) {
-            return Err(invalid("must be ASCII without spaces".to_owned()));
+            return Err(invalid("must be ASCII without spaces"));
         }
-        let mut hosts = authority.split(',').map(|authority| host_and_port(authority, scheme));
-        let (host, port) = hosts.next().ok_or_else(|| invalid("has no host".to_owned()))??;
+        let mut hosts = authority.split(',').map(|authority| host_and_port(authority, default_port));
+        let (host, port) = hosts.next().ok_or_else(|| invalid("has no host"))??;
         let others = hosts.collect::<Result<Vec<_>>>()?;
-        if !others.is_empty() && !scheme.is_kafka() {
-            return Err(invalid("may name several hosts for Kafka alone".to_owned()));
+        if !others.is_empty() && rest != Rest::Hosts {
+            return Err(invalid("may name several hosts for Kafka alone"));
         }
         let path = if path.is_empty() { "/".to_owned() } else { path.to_owned() };
-        Ok(Self { scheme, host, port, others, path })
-    }
-
-    const fn without_host(scheme: Scheme, path: String) -> Self {
-        Self { scheme, host: String::new(), port: 0, others: Vec::new(), path }
-    }
-
-    /// The serial device of an address such as `serial:///dev/ttyUSB0?baud=4800`.
-    ///
-    /// # Errors
-    /// `InvalidArgument` naming `address`.
-    pub fn serial_line(&self) -> Result<SerialLine> {
-        let invalid = |message: &str| Error::invalid("address", message);
-        let (path, query) =
-            self.path.split_once('?').map_or((self.path.as_str(), None), |(path, query)| (path, Some(query)));
-        let is_device = path.strip_prefix("/dev/").is_some_and(|rest| {
-            !rest.is_empty() && rest.split('/').all(|part| !matches!(part, "" | "." | ".."))
-        });
-        if !is_device || path.contains(char::is_control) {
-            return Err(invalid("must name a device below /dev/, such as serial:///dev/ttyUSB0?baud=4800"));
-        }
-        let baud = match query {
-            None => Some(SerialLine::NMEA_BAUD),
-            Some(query) => query.strip_prefix("baud=").and_then(|baud| baud.parse().ok()),
-        };
-        let baud = baud.filter(|baud| SerialLine::BAUDS.contains(baud));
-        let baud = baud.ok_or_else(|| {
-            let known: Vec<String> = SerialLine::BAUDS.iter().map(u32::to_string).collect();
-            invalid(&format!("must end after the device, or with ?baud= and one of {}", known.join(", ")))
-        })?;
-        Ok(SerialLine { path: path.into(), baud })
+        Ok(Self { scheme: name, is_encrypted, host, port, others, path })
     }
 }
 
-/// A host without the brackets of IPv6, and its port or that of the scheme.
-fn host_and_port(authority: &str, scheme: Scheme) -> Result<(String, u16)> {
-    let invalid = |message: &str| Error::invalid("address", message);
+/// The refusal of an address.
+pub(crate) fn invalid(message: &str) -> Error {
+    Error::invalid("address", message)
+}
+
+/// A host without the brackets of IPv6, and its port or the default one.
+fn host_and_port(authority: &str, default_port: Option<u16>) -> Result<(String, u16)> {
     let (host, port) = match authority.rsplit_once(':') {
         Some((host, port)) if !port.ends_with(']') => {
             let port = port.parse().ok().filter(|port| *port > 0);
@@ -251,21 +163,6 @@ fn host_and_port(authority: &str, scheme: Scheme) -> Result<(String, u16)> {
     if host.is_empty() || !host.bytes().all(is_host) {
         return Err(invalid("has no host"));
     }
-    let port = port.or(scheme.default_port());
+    let port = port.or(default_port);
     Ok((host.to_owned(), port.ok_or_else(|| invalid("must name a port, as in HOST:PORT"))?))
-}
-
-/// A serial device with the speed of its line.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct SerialLine {
-    /// Its path, below `/dev/`.
-    pub path: std::path::PathBuf,
-    /// Bits per second.
-    pub baud: u32,
-}
-
-impl SerialLine {
-    /// Speed of NMEA 0183; AIS receivers have 38400.
-    const NMEA_BAUD: u32 = 4_800;
-    const BAUDS: [u32; 9] = [4_800, 9_600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600];
 }

@@ -8,19 +8,19 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::address::{Address, Scheme};
+use super::address::Address;
+use super::kinds::{
+    LoginFields, SaslMechanism, SinkContent, SinkFields, SinkKind, SourceFields, SourceKind, Topic,
+    sink_address, source_address,
+};
 use super::messages::{JsonMapping, MessageFormat};
 use super::track_files::TrackFileFormat;
-use crate::domain::{
-    CameraId, Error, ImageArea, ImageSize, ReceiverId, Result, Score, TargetClass, TargetId, check_text,
-};
+use crate::domain::{CameraId, Error, ImageArea, ImageSize, ReceiverId, Result, Score, SiteId, TargetClass};
 
 /// Cameras that a connection may name.
 const MAX_CAMERAS: usize = 1_024;
 /// Classes that a source may take.
 const MAX_CLASSES: usize = 64;
-/// Topics that a source may subscribe to.
-const MAX_TOPICS: usize = 64;
 
 /// A connection to be created: either a source or a sink.
 #[derive(Deserialize, ToSchema)]
@@ -92,20 +92,6 @@ pub struct StreamSize {
     pub width_px: u32,
     /// Height of the image, px.
     pub height_px: u32,
-}
-
-/// How a user signs in to Kafka (SASL).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum SaslMechanism {
-    /// The password is sent as it is (RFC 4616).
-    Plain,
-    /// A challenge is answered, with SHA-256 (RFC 7677).
-    #[serde(rename = "scram_sha_256")]
-    ScramSha256,
-    /// A challenge is answered, with SHA-512.
-    #[serde(rename = "scram_sha_512")]
-    ScramSha512,
 }
 
 /// The origin of the receiver's name if a message does not contain one.
@@ -226,8 +212,8 @@ impl OutgoingFormat {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SinkSettings {
-    /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]`, `kafka://HOST[:9092]`, `kafkas://HOST[:9093]` and `nats://HOST[:4222]`
-    /// publish; `http://` and `https://` post (a webhook); `tcp://`, `tls://` and `udp://HOST:PORT`, also of a multicast group, send; `file:` writes files to the folder of the setting
+    /// `mqtt://HOST[:1883]`, `mqtts://HOST[:8883]`, `kafka://HOST[:9092]`, `kafkas://HOST[:9093]`, `nats://HOST[:4222]` and
+    /// `natss://HOST[:4222]` publish; `http://` and `https://` post (a webhook); `tcp://`, `tls://` and `udp://HOST:PORT`, also of a multicast group, send; `file:` writes files to the folder of the setting
     /// `export_folder`.
     #[schema(max_length = 512, example = "https://hooks.example.org/positions")]
     pub address: String,
@@ -236,7 +222,7 @@ pub struct SinkSettings {
     pub format: OutgoingFormat,
     /// Topic of MQTT or Kafka, or subject of NATS; `{camera}` and `{target}` are replaced by their ids.
     /// `sightfix/{camera}/{target}` if left out, with points for NATS, and `sightfix` for Kafka, whose messages have the key
-    /// `{camera}/{target}`.
+    /// `{camera}/{target}`. For events of places `{place}` and `{kind}` are replaced; `sightfix/events/{place}` if left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub topic: Option<String>,
     /// Name of the user, where the peer asks for one; the secret `password` belongs to it.
@@ -248,9 +234,17 @@ pub struct SinkSettings {
     /// Authority of the peer's certificate (PEM); those of the operating system if left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ca_certificate: Option<String>,
-    /// Cameras whose tracks are sent.
-    #[schema(min_items = 1, max_items = 1024, example = json!(["gate"]))]
+    /// The contents of the messages.
+    #[serde(default)]
+    pub content: SinkContent,
+    /// Cameras whose tracks, or the events of whose places, are sent.
+    #[serde(default)]
+    #[schema(max_items = 1024, example = json!(["gate"]))]
     pub camera_ids: Vec<String>,
+    /// Sites the events of whose places are sent.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schema(max_items = 1024, example = json!(["harbour"]))]
+    pub site_ids: Vec<String>,
     /// Least time between two positions of a target, s; 1 if left out, 0 for every one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.0, maximum = 86400.0)]
@@ -269,6 +263,9 @@ pub struct SinkSettings {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 1.0, maximum = 86400.0)]
     pub rotate_s: Option<f64>,
+    /// True if a message to NATS counts as delivered only when a JetStream stream has stored it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub jetstream: bool,
 }
 
 /// The secrets of a connection, by name; they are never shown.
@@ -401,23 +398,27 @@ impl SourceSettings {
     /// # Errors
     /// `InvalidArgument` naming `address`.
     pub fn address(&self) -> Result<Address> {
-        Address::parse(&self.address, Scheme::SOURCES)
+        source_address(&self.address)
+    }
+
+    /// The settings that its kind knows.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming the field, also for one that the kind does not know.
+    pub fn kind(&self) -> Result<SourceKind> {
+        let login = LoginFields {
+            username: self.username.clone(),
+            sasl_mechanism: self.sasl_mechanism,
+            ca_certificate: self.ca_certificate.clone(),
+        };
+        SourceKind::new(
+            &self.address,
+            SourceFields { format: self.format, topics: self.topics.clone(), login },
+        )
     }
 
     fn check(&self) -> Result<()> {
-        let address = self.address()?;
-        if address.scheme.subscribes() == self.topics.is_empty() || self.topics.len() > MAX_TOPICS {
-            let rule = "must be 1 to 64 for MQTT and Kafka, and none for other addresses";
-            return Err(Error::invalid("topics", rule));
-        }
-        for topic in &self.topics {
-            check_text("topics", topic, 1_024)?;
-            if address.scheme.is_kafka() && !is_kafka_topic(topic) {
-                return Err(Error::invalid("topics", KAFKA_TOPIC_RULE));
-            }
-        }
-        check_username(self.username.as_deref())?;
-        check_sasl(self.sasl_mechanism, address.scheme, self.username.as_deref())?;
+        self.kind()?;
         self.check_items()?;
         if self.brings_fixes() {
             if self.camera_ids.is_empty() {
@@ -428,12 +429,6 @@ impl SourceSettings {
                     "is for detections; the profile of the camera (receivers) says whose a receiver is";
                 return Err(Error::invalid("ids_name_targets", rule));
             }
-        }
-        if address.scheme == Scheme::Gpsd && self.format != MessageFormat::Gpsd {
-            return Err(Error::invalid("format", "must be gpsd for an address of gpsd:"));
-        }
-        if address.scheme.is_rtsp() && self.format != MessageFormat::Onvif {
-            return Err(Error::invalid("format", "must be onvif for an address of rtsp: or rtsps:"));
         }
         self.fix_cameras()?;
         self.receiver()?;
@@ -455,7 +450,7 @@ impl SourceSettings {
     /// phones send a position only after the answer to the one before, and a fix may wait seconds for its box.
     #[must_use]
     pub fn answers_at_once(&self) -> bool {
-        let is_pushed = self.address().is_ok_and(|address| address.scheme == Scheme::Push);
+        let is_pushed = matches!(self.kind(), Ok(SourceKind::Push));
         is_pushed && self.format == MessageFormat::Phone
     }
 
@@ -540,39 +535,50 @@ impl SinkSettings {
     /// # Errors
     /// `InvalidArgument` naming `address`.
     pub fn address(&self) -> Result<Address> {
-        Address::parse(&self.address, Scheme::SINKS)
+        sink_address(&self.address)
+    }
+
+    /// The settings that its kind knows.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming the field, also for one that the kind does not know.
+    pub fn kind(&self) -> Result<SinkKind> {
+        let login = LoginFields {
+            username: self.username.clone(),
+            sasl_mechanism: self.sasl_mechanism,
+            ca_certificate: self.ca_certificate.clone(),
+        };
+        let fields = SinkFields {
+            track_file: self.format.track_file(),
+            content: self.content,
+            topic: self.topic.clone(),
+            multicast_ttl: self.multicast_ttl,
+            rotate_s: self.rotate_s,
+            jetstream: self.jetstream,
+            login,
+        };
+        SinkKind::new(&self.address, fields)
     }
 
     fn check(&self) -> Result<()> {
-        let scheme = self.address()?.scheme;
-        let writes_files = scheme == Scheme::File;
-        if writes_files != self.format.track_file().is_some() {
-            return Err(Error::invalid(
-                "format",
-                "must be gpx or kml for the address file:, and for no other",
-            ));
-        }
-        if self.format == OutgoingFormat::HomeAssistant && !scheme.is_mqtt() {
+        let kind = self.kind()?;
+        if self.format == OutgoingFormat::HomeAssistant && !matches!(kind, SinkKind::Mqtt(_)) {
             return Err(Error::invalid("format", "can be home_assistant for addresses of MQTT alone"));
         }
-        check_username(self.username.as_deref())?;
-        check_sasl(self.sasl_mechanism, scheme, self.username.as_deref())?;
-        if self.camera_ids.is_empty() {
-            return Err(Error::invalid("camera_ids", "must name the cameras whose tracks are sent"));
+        if self.content == SinkContent::PlaceEvents && self.format != OutgoingFormat::Json {
+            return Err(Error::invalid("format", "must be json for events of places"));
+        }
+        if self.content == SinkContent::Positions && !self.site_ids.is_empty() {
+            return Err(Error::invalid("site_ids", "is for events of places alone"));
+        }
+        if self.camera_ids.is_empty() && self.site_ids.is_empty() {
+            return Err(Error::invalid(
+                "camera_ids",
+                "must name the cameras whose tracks or events are sent",
+            ));
         }
         self.cameras()?;
-        if let Some(topic) = &self.topic {
-            check_text("topic", topic, 1_024)?;
-            let wildcards: &[char] = if scheme == Scheme::Nats { &[' ', '*', '>'] } else { &['+', '#'] };
-            if topic.contains(wildcards) {
-                return Err(Error::invalid("topic", "must not contain wildcards"));
-            }
-            // With the longest ids.
-            let longest = topic.replace("{camera}", &"c".repeat(63)).replace("{target}", &"t".repeat(128));
-            if scheme.is_kafka() && !is_kafka_topic(&longest) {
-                return Err(Error::invalid("topic", KAFKA_TOPIC_RULE));
-            }
-        }
+        self.sites()?;
         for (field, value, least) in [
             ("min_interval_s", self.min_interval_s, 0.0),
             ("stale_s", self.stale_s, 1.0),
@@ -600,39 +606,24 @@ impl SinkSettings {
         cameras(&self.camera_ids)
     }
 
-    /// Where a target's position goes: its topic, its subject in NATS, or `TOPIC/KEY` in Kafka, whose keys are
-    /// `CAMERA/TARGET`. Characters of the target's id that topics cannot have, or that separate their levels, become `_`.
-    #[must_use]
-    pub fn topic_of(&self, camera: &CameraId, target: &TargetId) -> String {
-        let scheme = self.address.split_once(':').map_or("", |(scheme, _)| scheme);
-        let (default, special): (&str, fn(char) -> bool) = match scheme {
-            "nats" => ("sightfix.{camera}.{target}", |it| " .*>".contains(it)),
-            "kafka" | "kafkas" => ("sightfix", |it| !is_kafka_character(it)),
-            _ => ("sightfix/{camera}/{target}", |it| "/+#".contains(it)),
-        };
-        let template = self.topic.as_deref().unwrap_or(default);
-        let level = target.as_str().replace(special, "_");
-        let topic = template.replace("{camera}", camera.as_str()).replace("{target}", &level);
-        if scheme.starts_with("kafka") { format!("{topic}/{camera}/{target}") } else { topic }
+    /// The topic of each message.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming the field that is wrong.
+    pub fn topic(&self) -> Result<Topic> {
+        Ok(self.kind()?.topic(self.content))
     }
-}
 
-/// The rule for names of topics in Kafka.
-const KAFKA_TOPIC_RULE: &str = "must be 1 to 249 letters, digits, dots, hyphens and underscores for Kafka";
-
-const fn is_kafka_character(it: char) -> bool {
-    it.is_ascii_alphanumeric() || matches!(it, '.' | '-' | '_')
-}
-
-fn is_kafka_topic(name: &str) -> bool {
-    (1..=249).contains(&name.len()) && name.chars().all(is_kafka_character) && !matches!(name, "." | "..")
-}
-
-fn check_sasl(mechanism: Option<SaslMechanism>, scheme: Scheme, username: Option<&str>) -> Result<()> {
-    if mechanism.is_some() && (!scheme.is_kafka() || username.is_none()) {
-        return Err(Error::invalid("sasl_mechanism", "is for Kafka with a username"));
+    /// The sites the events of whose places are sent.
+    ///
+    /// # Errors
+    /// `InvalidArgument` naming `site_ids`.
+    pub fn sites(&self) -> Result<Vec<SiteId>> {
+        if self.site_ids.len() > MAX_CAMERAS {
+            return Err(Error::invalid("site_ids", "must be at most 1,024"));
+        }
+        self.site_ids.iter().map(|id| SiteId::new(id).map_err(|error| error.at("site_ids"))).collect()
     }
-    Ok(())
 }
 
 fn cameras(ids: &[String]) -> Result<Vec<CameraId>> {
@@ -641,8 +632,4 @@ fn cameras(ids: &[String]) -> Result<Vec<CameraId>> {
     }
     let camera = |id: &String| CameraId::new(id).map_err(|error| error.at("camera_ids"));
     ids.iter().map(camera).collect()
-}
-
-fn check_username(username: Option<&str>) -> Result<()> {
-    username.map_or(Ok(()), |name| check_text("username", name, 256))
 }

@@ -5,8 +5,8 @@ use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use jiff::Timestamp;
 
 use crate::domain::{
-    AuditNumber, CameraId, ConnectionId, Error, EvaluationId, KeyId, Result, RunId, SampleKey, SiteId,
-    TargetId,
+    AuditNumber, CameraId, ConnectionId, Error, EvaluationId, HistoryKey, KeyId, PlaceId, Result, RunId,
+    SampleKey, SiteId, TargetId,
 };
 
 /// Largest accepted cursor, bytes.
@@ -72,6 +72,21 @@ impl Cursor for SampleKey {
     }
 }
 
+/// The place of a position in a history.
+impl Cursor for HistoryKey {
+    const LIST: &'static str = "history";
+
+    fn to_key(&self) -> String {
+        format!("{}:{}", self.time.as_nanosecond(), self.track)
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        let (time_ns, track) = key.split_once(':')?;
+        let time = Timestamp::from_nanosecond(time_ns.parse().ok()?).ok()?;
+        Some(Self { time, track: track.to_owned() })
+    }
+}
+
 /// Target of a track.
 impl Cursor for TargetId {
     const LIST: &'static str = "tracks";
@@ -86,6 +101,18 @@ impl Cursor for TargetId {
 }
 
 impl Cursor for SiteId {
+    const LIST: &'static str = "sites";
+
+    fn to_key(&self) -> String {
+        self.as_str().to_owned()
+    }
+
+    fn from_key(key: &str) -> Option<Self> {
+        Self::new(key).ok()
+    }
+}
+
+impl Cursor for PlaceId {
     const LIST: &'static str = "sites";
 
     fn to_key(&self) -> String {

@@ -39,11 +39,15 @@ mod frame_files;
 mod gnss_logger;
 mod gpsd;
 mod gpx;
+mod history;
 mod home_assistant;
 mod json_errors;
 mod json_violations;
+pub mod kinds;
 mod lines;
 mod messages;
+mod mot;
+mod moving_features;
 mod nmea_fixes;
 mod objects_only;
 mod onvif_device;
@@ -60,10 +64,10 @@ pub mod wire;
 mod write;
 mod xml;
 
-pub use address::{Address, Scheme, SerialLine, bracketed};
+pub use address::{Address, bracketed};
 pub use connection::{
-    CameraMapping, ConnectionDraft, ConnectionSettings, ImagePoint, OutgoingFormat, ReceiverFrom,
-    SaslMechanism, Secrets, SinkSettings, SourceSettings,
+    CameraMapping, ConnectionDraft, ConnectionSettings, ImagePoint, OutgoingFormat, ReceiverFrom, Secrets,
+    SinkSettings, SourceSettings,
 };
 pub use csv_layout::{BoxForm, BoxUnit, ColumnNames, CsvLayout, LaidOut};
 pub use cursor::{Cursor, read_cursor, write_cursor};
@@ -71,11 +75,14 @@ pub use file_row::RowError;
 pub use fixes::{TimedFix, read_fixes, read_received_fixes};
 pub use format::{FixFormat, Format};
 pub use frame_files::{FrameClock, FrameFileFormat, frame_number, read_frame_file};
+pub use history::{HistoryFormat, HistoryWriter};
 pub use home_assistant::{home_assistant_attributes, home_assistant_discovery};
 pub use messages::{
     BoxMapping, DetectedBox, JsonMapping, MessageContext, MessageDecoder, MessageFormat, MessageItem,
     NamedDetection, Reading, decoder,
 };
+pub use mot::MotFrames;
+pub use moving_features::{MovingFeature, MovingFeatures, MovingTarget, PathPoint};
 pub use onvif_device::{OnvifRequest, SOAP};
 pub use outgoing::{OutgoingPosition, cot_event, onvif_frame, position_json};
 pub use recording::{read_recording, write_recording};

@@ -3,7 +3,7 @@
 
 use quick_xml::Reader;
 use quick_xml::escape::{escape, unescape};
-use quick_xml::events::Event;
+use quick_xml::events::{BytesStart, Event};
 
 use crate::xml::{Element as _, not_xml};
 
@@ -59,29 +59,33 @@ fn path(url: &str) -> Option<String> {
     Some(rest.find('/').map_or("/", |begin| &rest[begin..]).to_owned())
 }
 
-/// The text of the first element of a name.
+/// The text of the first element of a name; an empty one has none.
 fn text(document: &str, name: &str) -> Result<Option<String>, String> {
-    let mut xml = Reader::from_str(document);
-    loop {
-        match xml.read_event().map_err(not_xml)? {
-            Event::Eof => return Ok(None),
-            Event::Start(element) if element.local_name().as_ref() == name => {
-                let content = xml.read_text(element.name()).map_err(not_xml)?;
-                return Ok(Some(unescape(&content).map_err(not_xml)?.into_owned()));
-            }
-            _ => {}
-        }
-    }
+    first(document, name, |xml, element| {
+        let content = xml.read_text(element.name()).map_err(not_xml)?;
+        Ok(Some(unescape(&content).map_err(not_xml)?.into_owned()))
+    })
 }
 
 /// An attribute of the first element of a name.
 fn attribute(document: &str, name: &str, attribute: &str) -> Result<Option<String>, String> {
+    first(document, name, |_, element| element.attribute(attribute))
+}
+
+/// Reads the first element of a name, if there is one.
+fn first(
+    document: &str,
+    name: &str,
+    read: impl FnOnce(&mut Reader<&[u8]>, &BytesStart<'_>) -> Result<Option<String>, String>,
+) -> Result<Option<String>, String> {
     let mut xml = Reader::from_str(document);
+    // An empty element is read as one that begins and ends.
+    xml.config_mut().expand_empty_elements = true;
     loop {
         match xml.read_event().map_err(not_xml)? {
             Event::Eof => return Ok(None),
-            Event::Start(element) | Event::Empty(element) if element.local_name().as_ref() == name => {
-                return element.attribute(attribute);
+            Event::Start(element) if element.local_name().as_ref() == name => {
+                return read(&mut xml, &element);
             }
             _ => {}
         }
@@ -110,7 +114,9 @@ mod tests {
 
     #[test]
     fn an_answer_without_what_was_asked_for_is_refused() {
-        for document in ["", "<r/>", "no XML <", "<r><Uri>still.jpg</Uri></r>", "<r><Uri>http://x"] {
+        for document in
+            ["", "<r/>", "no XML <", "<r><Uri>still.jpg</Uri></r>", "<r><Uri>http://x", "<r><Uri/></r>"]
+        {
             OnvifRequest::SnapshotUri("1".to_owned()).answer(document).expect_err(document);
         }
     }

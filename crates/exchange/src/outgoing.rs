@@ -6,7 +6,7 @@ use jiff::{SignedDuration, Timestamp};
 use serde::Serialize;
 
 use super::wire::{PlaneCovariance, Position};
-use crate::domain::{CameraId, TargetId};
+use crate::domain::{CameraId, ReceiverMatch, TargetId};
 use crate::geo;
 
 /// Where a target is, to be sent.
@@ -18,6 +18,8 @@ pub struct OutgoingPosition<'a> {
     pub camera_id: &'a CameraId,
     /// The target.
     pub target_id: &'a TargetId,
+    /// The receiver that the target carries, where it was found by association.
+    pub receiver_match: Option<&'a ReceiverMatch>,
     /// The instant measured.
     pub time: Timestamp,
     /// Where it is.
@@ -36,12 +38,20 @@ struct PositionJson<'a> {
     id: &'a str,
     camera_id: &'a str,
     target_id: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    receiver_match: Option<ReceiverMatchJson<'a>>,
     time: Timestamp,
     position: Position,
     r95_m: f64,
     covariance: PlaneCovariance,
     velocity_east_m_s: f64,
     velocity_north_m_s: f64,
+}
+
+#[derive(Serialize)]
+struct ReceiverMatchJson<'a> {
+    receiver_id: &'a str,
+    probability: f64,
 }
 
 /// A position as a JSON object.
@@ -52,6 +62,10 @@ pub fn position_json(position: &OutgoingPosition<'_>) -> Vec<u8> {
         id: position.message_id,
         camera_id: position.camera_id.as_str(),
         target_id: position.target_id.as_str(),
+        receiver_match: position.receiver_match.map(|own| ReceiverMatchJson {
+            receiver_id: own.receiver_id.as_str(),
+            probability: own.probability,
+        }),
         time: position.time,
         position: position.position.into(),
         r95_m: position.r95_m,

@@ -169,6 +169,95 @@ impl From<domain::Motion> for Motion {
     }
 }
 
+/// A position of a finished track.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, ToSchema)]
+pub struct HistoryPosition<'a> {
+    /// The instant.
+    #[schema(value_type = String, format = DateTime)]
+    pub time: Timestamp,
+    /// The camera whose track it is, if it is one of a camera.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub camera_id: Option<&'a str>,
+    /// The site whose world track it is, if it is one of a site.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub site_id: Option<&'a str>,
+    /// The track, unique within camera or site.
+    pub track_id: &'a str,
+    /// The target, if it is known: in a camera as the camera names it, in a site the carrier of a receiver.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub target_id: Option<&'a str>,
+    /// Class reported by a detector.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub class: Option<&'a str>,
+    /// The target's position.
+    pub position: Position,
+    /// Covariance of the position's error.
+    pub covariance: PlaneCovariance,
+    /// Speed and course.
+    #[serde(flatten)]
+    pub motion: Motion,
+    /// Mean acceleration over the second before; missing at the first position of a track.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub acceleration: Option<Acceleration>,
+}
+
+/// A mean acceleration.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, ToSchema)]
+pub struct Acceleration {
+    /// Component towards east, m/s2.
+    pub east_mps2: f64,
+    /// Component towards north, m/s2.
+    pub north_mps2: f64,
+    /// Variance of the error towards east.
+    pub covariance_east_m2_s4: f64,
+    /// Variance of the error towards north.
+    pub covariance_north_m2_s4: f64,
+    /// Covariance of both errors.
+    pub covariance_east_north_m2_s4: f64,
+}
+
+impl Acceleration {
+    /// All of it, in the order of the fields.
+    #[must_use]
+    pub const fn numbers(&self) -> [f64; 5] {
+        let Self { east_mps2, north_mps2, .. } = *self;
+        let [east_m2_s4, north_m2_s4] = [self.covariance_east_m2_s4, self.covariance_north_m2_s4];
+        [east_mps2, north_mps2, east_m2_s4, north_m2_s4, self.covariance_east_north_m2_s4]
+    }
+}
+
+impl From<domain::Acceleration> for Acceleration {
+    fn from(acceleration: domain::Acceleration) -> Self {
+        let covariance = acceleration.covariance;
+        Self {
+            east_mps2: acceleration.east_m_s2,
+            north_mps2: acceleration.north_m_s2,
+            covariance_east_m2_s4: covariance.east_m2,
+            covariance_north_m2_s4: covariance.north_m2,
+            covariance_east_north_m2_s4: covariance.east_north_m2,
+        }
+    }
+}
+
+impl<'a> HistoryPosition<'a> {
+    /// A position of a camera or site.
+    #[must_use]
+    pub fn of(scope: &'a domain::TrackScope, row: &'a domain::ArchivedPosition) -> Self {
+        Self {
+            time: row.time,
+            camera_id: scope.camera().map(domain::CameraId::as_str),
+            site_id: scope.site().map(domain::SiteId::as_str),
+            track_id: &row.track,
+            target_id: row.target.as_ref().map(domain::TargetId::as_str),
+            class: row.class.as_ref().map(domain::TargetClass::as_str),
+            position: row.position.into(),
+            covariance: row.covariance_m2.into(),
+            motion: row.motion.into(),
+            acceleration: row.acceleration.map(Into::into),
+        }
+    }
+}
+
 /// A box around a target, in pixels from the image's upper left corner.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
@@ -273,6 +362,10 @@ pub struct Observation<'a> {
     /// The fix.
     #[serde(default)]
     pub fix: Option<Fix>,
+    /// Class reported by the detector; a fusion makes no use of it, tracks keep it.
+    #[serde(borrow, default)]
+    #[schema(value_type = Option<String>, min_length = 1, max_length = 128, example = "person")]
+    pub class: Option<Text<'a>>,
 }
 
 impl Observation<'_> {
@@ -297,9 +390,11 @@ impl Observation<'_> {
             }
             (target_id, _) => (target_id, time, fix),
         };
-        domain::Observation::new(time, target_id, bounding_box, fix)?.with_tracker_id(
-            self.tracker_id.as_ref().map(|id| domain::TrackerId::new(id.as_str())).transpose()?,
-        )
+        let tracker_id =
+            self.tracker_id.as_ref().map(|id| domain::TrackerId::new(id.as_str())).transpose()?;
+        let class = self.class.as_ref().map(|class| domain::TargetClass::new(class.as_str())).transpose()?;
+        let observation = domain::Observation::new(time, target_id, bounding_box, fix)?;
+        Ok(observation.with_tracker_id(tracker_id)?.with_class(class))
     }
 }
 

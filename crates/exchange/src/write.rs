@@ -173,20 +173,20 @@ pub fn write_fused<'a, W: Write>(
 }
 
 /// The framing of a document: beginning, separators and end.
-struct PositionDocument<W> {
-    out: W,
-    format: Format,
+pub(super) struct PositionDocument<W> {
+    pub(super) out: W,
+    pub(super) format: Format,
     /// Name of the array in a JSON document.
     name: &'static str,
     has_begun: bool,
 }
 
 impl<W: Write> PositionDocument<W> {
-    const fn new(out: W, format: Format, name: &'static str) -> Self {
+    pub(super) const fn new(out: W, format: Format, name: &'static str) -> Self {
         Self { out, format, name, has_begun: false }
     }
 
-    fn csv_row(
+    pub(super) fn csv_row(
         &mut self,
         header: fn(&mut W) -> io::Result<()>,
         cells: impl FnOnce(&mut W) -> io::Result<()>,
@@ -198,7 +198,7 @@ impl<W: Write> PositionDocument<W> {
         cells(&mut self.out)
     }
 
-    fn json_row(&mut self, row: &impl Serialize) -> io::Result<()> {
+    pub(super) fn json_row(&mut self, row: &impl Serialize) -> io::Result<()> {
         match self.format {
             Format::Json | Format::GeoJson if self.has_begun => self.out.write_all(b",\n")?,
             Format::Json | Format::GeoJson => self.begin()?,
@@ -217,7 +217,7 @@ impl<W: Write> PositionDocument<W> {
         }
     }
 
-    fn finish(mut self, header: fn(&mut W) -> io::Result<()>) -> io::Result<W> {
+    pub(super) fn finish(mut self, header: fn(&mut W) -> io::Result<()>) -> io::Result<W> {
         match self.format {
             Format::Csv if !self.has_begun => header(&mut self.out)?,
             Format::Csv | Format::Ndjson => {}
@@ -303,7 +303,7 @@ fn fused_cells<W: Write>(out: &mut W, row: &wire::FusedFix<'_>) -> io::Result<()
     writeln!(out, "{}", row.flags)
 }
 
-fn degrees<W: Write>(out: &mut W, position: Option<wire::Position>) -> io::Result<()> {
+pub(super) fn degrees<W: Write>(out: &mut W, position: Option<wire::Position>) -> io::Result<()> {
     match position {
         Some(position) => write!(out, "{:.8},{:.8},", position.longitude_deg, position.latitude_deg),
         None => out.write_all(b",,"),
@@ -311,7 +311,7 @@ fn degrees<W: Write>(out: &mut W, position: Option<wire::Position>) -> io::Resul
 }
 
 /// An optional value, followed by a comma.
-fn cell<W: Write>(out: &mut W, value: Option<impl Display>) -> io::Result<()> {
+pub(super) fn cell<W: Write>(out: &mut W, value: Option<impl Display>) -> io::Result<()> {
     match value {
         Some(value) => write!(out, "{value},"),
         None => out.write_all(b","),
@@ -319,7 +319,7 @@ fn cell<W: Write>(out: &mut W, value: Option<impl Display>) -> io::Result<()> {
 }
 
 /// A name as a cell. Names contain no control characters, so only commas and quotes require quoting.
-fn text_cell(name: &str) -> Cow<'_, str> {
+pub(super) fn text_cell(name: &str) -> Cow<'_, str> {
     let name = guarded(name);
     if name.contains([',', '"']) { Cow::Owned(format!("\"{}\"", name.replace('"', "\"\""))) } else { name }
 }
@@ -327,7 +327,7 @@ fn text_cell(name: &str) -> Cow<'_, str> {
 /// A GeoJSON feature: a point with properties; the geometry is null where there is no position (RFC 7946,
 /// 3.2).
 #[derive(Serialize)]
-struct Feature<P> {
+pub(super) struct Feature<P> {
     r#type: &'static str,
     geometry: Option<PointGeometry>,
     properties: P,
@@ -340,7 +340,7 @@ struct PointGeometry {
 }
 
 impl<P> Feature<P> {
-    fn new(position: Option<wire::Position>, properties: P) -> Self {
+    pub(super) fn new(position: Option<wire::Position>, properties: P) -> Self {
         let geometry = position.map(|wire::Position { longitude_deg, latitude_deg }| PointGeometry {
             r#type: "Point",
             coordinates: [longitude_deg, latitude_deg],

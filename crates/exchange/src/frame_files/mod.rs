@@ -55,7 +55,7 @@ impl FrameClock {
         Err(Error::invalid("frame_rate", "must be above 0 and at most 1000 frames per second"))
     }
 
-    /// The clock of a file that begins so many frames later.
+    /// The clock of a file that begins `frames` frames later.
     ///
     /// # Errors
     /// `InvalidArgument` naming `frame` for one beyond all times.

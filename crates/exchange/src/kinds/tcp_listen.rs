@@ -1,0 +1,5 @@
+//! Ports of this machine that take lines.
+
+use crate::address::Scheme;
+
+pub(super) const SCHEMES: &[Scheme] = &[Scheme::host("tcp-listen", None)];

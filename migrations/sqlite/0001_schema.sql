@@ -10,6 +10,8 @@ CREATE TABLE sites (
     labels               TEXT    NOT NULL,
     origin_longitude_deg REAL,
     origin_latitude_deg  REAL,
+    -- How finished tracks are kept, as JSON; NULL keeps none.
+    history              TEXT,
     revision             INTEGER NOT NULL,
     created_at_us        INTEGER NOT NULL,
     updated_at_us        INTEGER NOT NULL,
@@ -383,3 +385,40 @@ CREATE TABLE camera_pictures (
     content       BLOB NOT NULL,
     updated_at_us INTEGER NOT NULL
 ) STRICT;
+
+-- Places on the ground, of a site or of a camera. `settings` is JSON. Keys are never used twice.
+CREATE TABLE places (
+    key           INTEGER PRIMARY KEY AUTOINCREMENT,
+    id            TEXT NOT NULL UNIQUE,
+    site_key      INTEGER REFERENCES sites (key) ON DELETE CASCADE,
+    camera_key    INTEGER REFERENCES cameras (key) ON DELETE CASCADE,
+    settings      TEXT NOT NULL,
+    revision      INTEGER NOT NULL,
+    created_at_us INTEGER NOT NULL,
+    updated_at_us INTEGER NOT NULL,
+    CHECK ((site_key IS NULL) <> (camera_key IS NULL))
+) STRICT;
+CREATE INDEX places_of_site ON places (site_key, id) WHERE site_key IS NOT NULL;
+CREATE INDEX places_of_camera ON places (camera_key, id) WHERE camera_key IS NOT NULL;
+
+-- Events of places, in the order of their commits. `content` is JSON. An event that is found again has the id of the first.
+CREATE TABLE place_events (
+    number       INTEGER PRIMARY KEY AUTOINCREMENT,
+    event_id     TEXT NOT NULL UNIQUE,
+    place_key    INTEGER NOT NULL REFERENCES places (key) ON DELETE CASCADE,
+    kind         TEXT NOT NULL,
+    stored_at_us INTEGER NOT NULL,
+    content      TEXT NOT NULL
+) STRICT;
+CREATE INDEX place_events_of_place ON place_events (place_key, number);
+
+-- Counts of places by minute and by hour (`step_s`), class ('' if unknown) and figure; values are added up.
+CREATE TABLE place_counts (
+    place_key INTEGER NOT NULL REFERENCES places (key) ON DELETE CASCADE,
+    step_s    INTEGER NOT NULL,
+    from_s    INTEGER NOT NULL,
+    class     TEXT NOT NULL,
+    figure    TEXT NOT NULL,
+    value     REAL NOT NULL,
+    PRIMARY KEY (place_key, step_s, from_s, class, figure)
+) STRICT, WITHOUT ROWID;

@@ -18,9 +18,10 @@ use crate::domain::{
     ApiKey, AuditEntry, AuditNumber, Camera, CameraId, CameraKey, CameraMoved, Connection, ConnectionId,
     ConnectionKey, DeadLetter, Detection, Durability, EpochReport, EvaluationId, EvaluationJob,
     EvaluationPlan, EvaluationProgress, ExpectedVersion, IdempotencyKey, JobState, KeyId, ModelMetadata,
-    ModelVersion, NewCamera, NewConnection, NewKey, NewSite, OutboxCounts, OutboxLog, OutboxMessage, Picture,
+    ModelVersion, NewCamera, NewConnection, NewKey, NewPlace, NewPlaceEvent, NewSite, OutboxCounts,
+    OutboxLog, OutboxMessage, Picture, Place, PlaceCount, PlaceEventFilter, PlaceId, PlaceKey,
     RecordingBounds, RecordingPart, Result, Revision, RunId, RunProgress, SecretDigest, Site, SiteId,
-    SiteKey, SourceOffset, StoredSample, TrainingRun,
+    SiteKey, SourceOffset, StoredPlaceEvent, StoredPlaceEvents, StoredSample, TrackScope, TrainingRun,
 };
 use crate::geo::Position;
 
@@ -153,6 +154,72 @@ contract! {
     /// [`ErrorKind::SiteNotFound`], [`ErrorKind::RevisionMismatch`], [`ErrorKind::SiteInUse`] while cameras
     /// belong to it.
     fn delete_site(&self, id: &SiteId, expected: Option<ExpectedVersion<SiteKey>>, now: Timestamp) -> Result<()>;
+
+    /// Stores a new place with revision 1.
+    ///
+    /// # Errors
+    /// [`ErrorKind::PlaceExists`]; [`ErrorKind::InvalidArgument`] naming `site_id` or `camera_id` if there is no such one;
+    /// [`ErrorKind::InsufficientStorage`] beyond the limit of places.
+    fn insert_place(&self, profile: &NewPlace, now: Timestamp) -> Result<Place>;
+
+    /// One place.
+    ///
+    /// # Errors
+    /// [`ErrorKind::PlaceNotFound`].
+    fn place(&self, id: &PlaceId) -> Result<Place>;
+
+    /// A page of places, of a scope or of all, ordered by id, after an id.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn places(&self, scope: Option<&TrackScope>, after: Option<&PlaceId>, limit: u32) -> Result<Vec<Place>>;
+
+    /// Numbers that change with every change of a place: how many there are, their largest key and the sum of their
+    /// revisions.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn places_mark(&self) -> Result<[i64; 3]>;
+
+    /// Replaces the settings of a place and counts its revision up, if the stored revision is the expected one. Its scope
+    /// stays.
+    ///
+    /// # Errors
+    /// [`ErrorKind::PlaceNotFound`], [`ErrorKind::RevisionMismatch`].
+    fn replace_place(&self, profile: &NewPlace, expected: Option<ExpectedVersion<PlaceKey>>, now: Timestamp) -> Result<Place>;
+
+    /// Deletes a place with its events and counts, if its revision is the expected one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::PlaceNotFound`], [`ErrorKind::RevisionMismatch`].
+    fn delete_place(&self, id: &PlaceId, expected: Option<ExpectedVersion<PlaceKey>>, now: Timestamp) -> Result<()>;
+
+    /// Stores events, puts those that are new into the outboxes of sinks, and adds counts; all of it or nothing. Returns the
+    /// numbers of new events and of messages beyond the limits of outboxes. Events and counts of places that were deleted are passed over; the oldest events beyond the limit
+    /// are deleted, and counts that are too old.
+    ///
+    /// # Errors
+    /// [`ErrorKind::InsufficientStorage`].
+    fn insert_place_events(&self, events: &[NewPlaceEvent], counts: &[PlaceCount], now: Timestamp) -> Result<StoredPlaceEvents>;
+
+    /// A page of events in the order of their commits, after a number.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn place_events(&self, filter: &PlaceEventFilter, after: i64, limit: u32) -> Result<Vec<StoredPlaceEvent>>;
+
+    /// The number of the newest event and of the oldest one that is kept; 0 without one.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn place_event_bounds(&self) -> Result<(i64, i64)>;
+
+    /// Counts of a place by intervals of `step_s` that begin in a range of seconds since 1970, oldest first; of one class or
+    /// of all.
+    ///
+    /// # Errors
+    /// Faults only.
+    fn place_counts(&self, place: PlaceKey, step_s: u32, range_s: (i64, i64), class: Option<&str>) -> Result<Vec<PlaceCount>>;
 
     /// A page of samples ordered by time and target, after a key.
     ///

@@ -43,6 +43,9 @@ pub(super) const TABLES: &[Table] = &[
     Table { name: "idempotency_keys", key: "number" },
     Table { name: "connections", key: "key" },
     Table { name: "outbox", key: "number" },
+    Table { name: "places", key: "key" },
+    Table { name: "place_events", key: "number" },
+    Table { name: "place_counts", key: "place_key, step_s, from_s, class, figure" },
     Table { name: "source_offsets", key: "connection_key, topic, partition_number" },
 ];
 
@@ -55,6 +58,8 @@ const NUMBERED: &[(&str, &str)] = &[
     ("connections", "key"),
     ("recording_parts", "number"),
     ("outbox", "number"),
+    ("places", "key"),
+    ("place_events", "number"),
 ];
 
 impl Table {

@@ -11,6 +11,14 @@ pub struct StoreLimits {
     pub cameras: u32,
     /// Sites; more are refused.
     pub sites: u32,
+    /// Places; more are refused.
+    pub places: u32,
+    /// Events of all places; beyond, the oldest are deleted.
+    pub place_events: u32,
+    /// Days that the counts of a place by minutes are kept, before its newest ones.
+    pub place_minute_days: u32,
+    /// Days that its counts by hours are kept.
+    pub place_hour_days: u32,
     /// Connections with other systems; more are refused.
     pub outside_connections: u32,
     /// Waiting messages of one connection; beyond, the oldest is dropped.
@@ -48,6 +56,10 @@ impl Default for StoreLimits {
         Self {
             cameras: u32::MAX,
             sites: u32::MAX,
+            places: u32::MAX,
+            place_events: u32::MAX,
+            place_minute_days: 36_500,
+            place_hour_days: 36_500,
             outside_connections: u32::MAX,
             outbox_messages: u32::MAX,
             dead_letters: u32::MAX,

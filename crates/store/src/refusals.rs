@@ -1,6 +1,6 @@
 //! Refusals and faults that every backend states alike.
 
-use crate::domain::{CameraId, ConnectionId, Error, ErrorKind, EvaluationId, KeyId, RunId, SiteId};
+use crate::domain::{CameraId, ConnectionId, Error, ErrorKind, EvaluationId, KeyId, PlaceId, RunId, SiteId};
 
 /// A row that does not hold what was written: another program or the disk has changed it.
 #[derive(Debug, thiserror::Error)]
@@ -30,6 +30,10 @@ pub(super) fn no_camera(id: &CameraId) -> Error {
 
 pub(super) fn no_site(id: &SiteId) -> Error {
     Error::refused(ErrorKind::SiteNotFound, format!("no site has the id {id}"))
+}
+
+pub(super) fn no_place(id: &PlaceId) -> Error {
+    Error::refused(ErrorKind::PlaceNotFound, format!("no place has the id {id}"))
 }
 
 pub(super) fn no_connection(id: &ConnectionId) -> Error {

@@ -26,22 +26,12 @@ impl Database {
         let mut transaction = writer.begin().await?;
         let Some(position) = open_log(&mut transaction, key, log).await? else { return Ok(0) };
         for message in messages.iter().filter(|message| message.number > position) {
-            query(
-                "INSERT INTO outbox (connection_key, message_id, subject, payload, created_at_us) \
-                 SELECT key, $1, $2, $3, $4 FROM connections WHERE key = $5",
-            )
-            .bind(&message.message_id)
-            .bind(&message.subject)
-            .bind(&*message.payload)
-            .bind(message.created_at.as_microsecond())
-            .bind(key.0)
-            .execute(&mut transaction)
-            .await?;
+            insert_message(&mut transaction, key, message).await?;
         }
         if let Some(last) = messages.last().filter(|last| last.number > position) {
             note_position(&mut transaction, key, log, last.number).await?;
         }
-        let dropped = trim(&mut transaction, key, "IS NULL", self.limits().outbox_messages).await?;
+        let dropped = trim_queued(&mut transaction, key, self.limits().outbox_messages).await?;
         transaction.commit().await?;
         Ok(dropped)
     }
@@ -168,6 +158,26 @@ impl Database {
     }
 }
 
+/// Appends a message. A connection that was deleted takes none.
+pub(super) async fn insert_message(
+    session: &mut dyn Session,
+    key: ConnectionKey,
+    message: &OutboxMessage,
+) -> Result<()> {
+    query(
+        "INSERT INTO outbox (connection_key, message_id, subject, payload, created_at_us) \
+         SELECT key, $1, $2, $3, $4 FROM connections WHERE key = $5",
+    )
+    .bind(&message.message_id)
+    .bind(&message.subject)
+    .bind(&*message.payload)
+    .bind(message.created_at.as_microsecond())
+    .bind(key.0)
+    .execute(session)
+    .await?;
+    Ok(())
+}
+
 /// How far the outbox has come in a log, which is known from then on. `None` for a connection that was deleted.
 async fn open_log(session: &mut dyn Session, key: ConnectionKey, log: &OutboxLog) -> Result<Option<i64>> {
     match session.connection() {
@@ -190,6 +200,11 @@ async fn note_position(
         .execute(session)
         .await?;
     Ok(())
+}
+
+/// Deletes the oldest waiting messages beyond a limit; how many.
+pub(super) async fn trim_queued(session: &mut dyn Session, key: ConnectionKey, limit: u32) -> Result<u64> {
+    trim(session, key, "IS NULL", limit).await
 }
 
 /// Deletes the oldest messages beyond a limit; how many.

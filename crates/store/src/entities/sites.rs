@@ -10,6 +10,7 @@ use crate::refusals::no_site;
 use crate::row_decoder::RowDecoder;
 use crate::row_decoder::StoredRow;
 use crate::rows::audit::Change;
+use crate::rows::history::StoredHistory;
 use crate::rows::sites::{
     check_limit, check_unused, check_version, read_site, site_columns as columns, site_exists,
 };
@@ -23,8 +24,8 @@ impl Database {
         let mut transaction = writer.begin().await?;
         lock_limit(&mut transaction, Limit::Sites).await?;
         let insert = query(concat!(
-            "INSERT INTO sites (display_name, labels, origin_longitude_deg, origin_latitude_deg, \
-             updated_at_us, id, created_at_us, revision) VALUES ($1, $2, $3, $4, $5, $6, $7, 1) \
+            "INSERT INTO sites (display_name, labels, origin_longitude_deg, origin_latitude_deg, history, \
+             updated_at_us, id, created_at_us, revision) VALUES ($1, $2, $3, $4, $5, $6, $7, $8, 1) \
              ON CONFLICT (id) DO NOTHING RETURNING ",
             columns!()
         ));
@@ -80,7 +81,7 @@ impl Database {
         check_version(&find_site(&mut transaction, &profile.id).await?, expected)?;
         let update = query(concat!(
             "UPDATE sites SET display_name = $1, labels = $2, origin_longitude_deg = $3, \
-             origin_latitude_deg = $4, updated_at_us = $5, revision = revision + 1 WHERE id = $6 RETURNING ",
+             origin_latitude_deg = $4, history = $5, updated_at_us = $6, revision = revision + 1 WHERE id = $7 RETURNING ",
             columns!()
         ));
         let row = bind_profile(update, profile, now)?
@@ -146,10 +147,12 @@ async fn find_site(session: &mut dyn Session, id: &SiteId) -> Result<Site> {
 
 /// Binds the changeable columns in the order that INSERT and UPDATE share.
 fn bind_profile(query: Query<StoredRow>, profile: &NewSite, now: Timestamp) -> Result<Query<StoredRow>> {
+    let history = profile.history.map(|it| serde_json::to_string(&StoredHistory::from(it))).transpose();
     Ok(query
         .bind(profile.display_name.clone())
         .bind(serde_json::to_string(&profile.labels).map_err(Error::fault)?)
         .bind(profile.origin.map(|origin| origin.longitude_deg()))
         .bind(profile.origin.map(|origin| origin.latitude_deg()))
+        .bind(history.map_err(Error::fault)?)
         .bind(now.as_microsecond()))
 }

@@ -27,6 +27,10 @@ pub(crate) enum Limit {
     ConnectionOwners = 6,
     /// Which weeks of samples have a partition.
     SamplePartitions = 7,
+    /// Number of places.
+    Places = 8,
+    /// The numbers of the events of places are in the order of their commits.
+    PlaceEvents = 9,
 }
 
 /// Waits until no other transaction may change how far a limit is used.

@@ -12,6 +12,7 @@ use crate::domain::{
 use crate::geo::Position;
 use crate::refusals::unknown_site;
 use crate::row_decoder::{RowDecoder, StoredRow};
+use crate::rows::history::StoredHistory;
 
 /// Which camera there is, and in which state.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -116,6 +117,7 @@ struct StoredProfile {
     receivers: Vec<StoredReceiver>,
     retrain_when_moved: bool,
     snapshot: Option<StoredSnapshot>,
+    history: Option<StoredHistory>,
 }
 
 /// Where a still picture is fetched, as it is stored.
@@ -161,6 +163,7 @@ pub(crate) fn write_profile(profile: &NewCamera) -> Result<String> {
             username: source.username().map(str::to_owned),
             password: source.password().map(str::to_owned),
         }),
+        history: profile.history.map(StoredHistory::from),
     };
     serde_json::to_string(&stored).map_err(Error::fault)
 }
@@ -187,6 +190,7 @@ fn read_profile(json: &str, id: CameraId) -> Result<NewCamera> {
         receivers: Receivers::new(receivers.collect::<Result<Vec<_>>>()?)?,
         retrain_when_moved: stored.retrain_when_moved,
         snapshot: snapshot.transpose()?,
+        history: stored.history.as_ref().map(StoredHistory::to_domain).transpose()?,
         ..NewCamera::named(id)
     })
 }

@@ -5,12 +5,13 @@ use std::collections::BTreeMap;
 use crate::domain::{Error, ErrorKind, ExpectedVersion, NewSite, Result, Site, SiteId, SiteKey};
 use crate::geo::Position;
 use crate::row_decoder::{RowDecoder, StoredRow};
+use crate::rows::history::StoredHistory;
 
 /// Columns to select, in the order of [`read_site`].
 macro_rules! site_columns {
     () => {
-        "key, id, display_name, labels, origin_longitude_deg, origin_latitude_deg, revision, created_at_us, \
-         updated_at_us, (SELECT count(*) FROM cameras WHERE site_key = sites.key) AS cameras"
+        "key, id, display_name, labels, origin_longitude_deg, origin_latitude_deg, history, revision, \
+         created_at_us, updated_at_us, (SELECT count(*) FROM cameras WHERE site_key = sites.key) AS cameras"
     };
 }
 
@@ -27,12 +28,15 @@ pub(crate) fn read_site(row: &StoredRow) -> Result<Site> {
     let (longitude_deg, latitude_deg): (Option<f64>, Option<f64>) = (fields.get()?, fields.get()?);
     let origin = longitude_deg.zip(latitude_deg);
     let origin = fields.checked(origin.map(|(east, north)| Position::new(east, north)).transpose())?;
+    let history = fields.parse_optional(|json: &str| {
+        serde_json::from_str::<StoredHistory>(json).map_err(Error::fault)?.to_domain()
+    })?;
     let revision = fields.revision()?;
     let (created_at, updated_at) = (fields.timestamp()?, fields.timestamp()?);
     let cameras = fields.count()?;
     Ok(Site {
         key,
-        profile: NewSite { id, display_name, labels, origin },
+        profile: NewSite { id, display_name, labels, origin, history },
         revision,
         created_at,
         updated_at,

@@ -2,8 +2,8 @@ use std::collections::BTreeMap;
 
 use super::*;
 use crate::domain::{
-    Camera, ClockOffset, GnssBiasSigma, GnssError, ImageSize, Receiver, ReceiverId, Receivers, Revision,
-    SampleCount, SigmaM, SnapshotSource, TargetClass,
+    Camera, ClockOffset, GnssBiasSigma, GnssError, HistorySettings, ImageSize, Receiver, ReceiverId,
+    Receivers, Revision, SampleCount, SigmaM, SnapshotSource, TargetClass,
 };
 use crate::{CameraVersion, ChangeMark, SampleFilter};
 
@@ -39,6 +39,7 @@ fn full(name: &str) -> NewCamera {
             SnapshotSource::new("http://192.0.2.7/", Some("viewer".to_owned()), Some("s3cret".to_owned()))
                 .expect("an address"),
         ),
+        history: Some(HistorySettings::new(7, 5_000_000, 2.5).expect("in range")),
     }
 }
 

@@ -8,6 +8,7 @@ mod evaluations;
 pub(super) mod group;
 mod keys;
 mod models;
+mod places;
 mod recordings;
 mod runs;
 mod samples;

@@ -8,7 +8,7 @@ use std::{env, fs};
 use protox::prost::Message as _;
 
 const FOLDER: &str = "proto";
-const FILES: [&str; 12] = [
+const FILES: [&str; 14] = [
     "sightfix/v1/values.proto",
     "sightfix/v1/camera_service.proto",
     "sightfix/v1/sample_service.proto",
@@ -18,8 +18,10 @@ const FILES: [&str; 12] = [
     "sightfix/v1/key_service.proto",
     "sightfix/v1/audit_service.proto",
     "sightfix/v1/site_service.proto",
+    "sightfix/v1/place_service.proto",
     "sightfix/v1/track_service.proto",
     "sightfix/v1/evaluation_service.proto",
+    "sightfix/v1/history_service.proto",
     "inference/open_inference_grpc.proto",
 ];
 

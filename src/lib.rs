@@ -28,10 +28,12 @@ pub mod telemetry;
 pub mod tls_client;
 pub mod worker;
 
+pub use sightfix_archive as archive;
 pub use sightfix_domain::{domain, geo, statistics};
 pub use sightfix_evaluation::{self as evaluation, paper_experiments};
 pub use sightfix_exchange as exchange;
 pub use sightfix_fusion as fusion;
 pub use sightfix_model::{self as model, filters};
+pub use sightfix_places as places;
 pub use sightfix_simulation as simulation;
 pub use sightfix_store as store;

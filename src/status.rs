@@ -61,6 +61,8 @@ pub fn of(kind: ErrorKind) -> Status {
         Kind::SiteNotFound => (404, code::NOT_FOUND, "There is no such site"),
         Kind::SiteExists => (409, code::ALREADY_EXISTS, "A site of that id exists already"),
         Kind::SiteInUse => (409, code::FAILED_PRECONDITION, "The site has cameras"),
+        Kind::PlaceNotFound => (404, code::NOT_FOUND, "There is no such place"),
+        Kind::PlaceExists => (409, code::ALREADY_EXISTS, "A place of that id exists already"),
         Kind::ConnectionNotFound => (404, code::NOT_FOUND, "There is no such connection"),
         Kind::ConnectionExists => (409, code::ALREADY_EXISTS, "A connection of that id exists already"),
         Kind::ConnectionNotReceiving => {

@@ -2,10 +2,13 @@
 
 use std::sync::Arc;
 
+use super::cluster::Nodes;
 use super::live::CameraActivity;
-use super::registry::ModelSummary;
+use super::registry::{ModelSummary, Registry};
 use super::{App, Page, page_of};
+use crate::clock::Clock;
 use crate::domain::{Camera, CameraId, JobState, Result, RunId};
+use crate::store::Store;
 
 /// A camera with its latest run, its model and what happens in its view.
 pub struct CameraStatus {
@@ -18,12 +21,34 @@ pub struct CameraStatus {
     pub activity: CameraActivity,
 }
 
+/// The status of cameras at a glance.
+#[derive(Clone, Copy)]
+pub struct CameraStatuses<'a> {
+    store: &'a Store,
+    registry: &'a Registry,
+    nodes: Nodes<'a>,
+    clock: &'a Clock,
+}
+
 impl App {
+    /// The status of cameras at a glance.
+    #[must_use]
+    pub fn camera_statuses(&self) -> CameraStatuses<'_> {
+        CameraStatuses {
+            store: &self.store,
+            registry: &self.registry,
+            nodes: self.nodes(),
+            clock: &self.clock,
+        }
+    }
+}
+
+impl CameraStatuses<'_> {
     /// The activity in the view of a stored camera, and its model; without its latest run.
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn camera_status(&self, id: &CameraId) -> Result<CameraStatus> {
+    pub async fn get(&self, id: &CameraId) -> Result<CameraStatus> {
         Ok(self.status_of(self.store.camera(id).await?, None))
     }
 
@@ -31,11 +56,7 @@ impl App {
     ///
     /// # Errors
     /// A fault of the store.
-    pub async fn camera_statuses(
-        &self,
-        after: Option<&CameraId>,
-        limit: u32,
-    ) -> Result<Page<CameraStatus, CameraId>> {
+    pub async fn list(&self, after: Option<&CameraId>, limit: u32) -> Result<Page<CameraStatus, CameraId>> {
         let cameras = self.store.cameras_with_latest_run(after, limit + 1).await?;
         let statuses = cameras.into_iter().map(|(camera, latest_run)| self.status_of(camera, latest_run));
         Ok(page_of(statuses.collect(), limit, |status| status.camera.id().clone()))
@@ -45,7 +66,9 @@ impl App {
         let active = self.registry.get(camera.id());
         CameraStatus {
             model_summary: active.as_ref().and_then(|active| active.model_summary.clone()),
-            activity: active.map_or_else(CameraActivity::default, |active| self.activity(&active)),
+            activity: active.map_or_else(CameraActivity::default, |active| {
+                CameraActivity::of(&active, self.nodes.owns_camera(&active), self.clock.monotonic())
+            }),
             camera,
             latest_run,
         }

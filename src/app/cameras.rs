@@ -1,10 +1,14 @@
 //! Camera profiles.
 
+use std::sync::Arc;
+
 use super::pictures::check_snapshot;
 use super::registry::Registry;
 use super::{App, Page, page_of};
 use crate::clock::Clock;
-use crate::domain::{Camera, CameraChange, CameraId, ExpectedVersion, NewCamera, Result, SiteId};
+use crate::domain::{
+    Camera, CameraChange, CameraId, CameraMoved, ExpectedVersion, NewCamera, Result, SiteId,
+};
 use crate::store::Store;
 
 /// The use cases of cameras and their profiles.
@@ -80,6 +84,12 @@ impl Cameras<'_> {
             ));
         }
         warnings
+    }
+
+    /// Returns the detected movement of a camera if its active model no longer fits what the camera sees.
+    #[must_use]
+    pub fn moved(&self, id: &CameraId) -> Option<Arc<CameraMoved>> {
+        self.registry.get(id)?.moved.clone()
     }
 
     /// Changes a profile, from the revision that the caller saw (any, if `None`).

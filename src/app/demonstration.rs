@@ -46,7 +46,7 @@ impl App {
         let Some((parts, stop)) = lock(&self.demonstration.0).clone() else { return Ok(()) };
         stop.cancel();
         for id in &parts.connections {
-            removed(self.delete_connection(id, None).await, ErrorKind::ConnectionNotFound)?;
+            removed(self.connections().delete(id, None).await, ErrorKind::ConnectionNotFound)?;
         }
         for id in &parts.cameras {
             removed(self.cameras().delete(id, None).await, ErrorKind::CameraNotFound)?;

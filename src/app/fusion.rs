@@ -3,31 +3,62 @@
 use std::sync::Arc;
 
 use super::App;
-use super::registry::ActiveCamera;
-use crate::domain::{CameraId, Error, ErrorKind, Flag, FusedFix, Observation, Result};
+use super::live::ResidualQueue;
+use super::registry::{ActiveCamera, Registry};
+use crate::clock::Clock;
+use crate::config::Limits;
+use crate::domain::{Error, ErrorKind, Flag, FusedFix, Observation, Result};
 use crate::fusion::observed::ObservedPositions;
 use crate::fusion::two_step;
+use crate::store::Store;
+use crate::telemetry::Metrics;
+
+/// Positions for observations, from the registry alone.
+#[derive(Clone, Copy)]
+pub struct Fusion<'a> {
+    store: &'a Store,
+    registry: &'a Registry,
+    residuals: &'a ResidualQueue,
+    clock: &'a Clock,
+    limits: &'a Limits,
+    metrics: &'a Metrics,
+}
 
 impl App {
+    /// Positions for observations, from the registry alone.
+    #[must_use]
+    pub fn fusion(&self) -> Fusion<'_> {
+        Fusion {
+            store: &self.store,
+            registry: &self.registry,
+            residuals: &self.residuals,
+            clock: &self.clock,
+            limits: &self.limits,
+            metrics: &self.metrics,
+        }
+    }
+}
+
+impl Fusion<'_> {
     /// Answers observations of one camera, all by the same model version. Takes no lock and never waits
     /// for the database, but to look for a model where there is none.
     ///
     /// # Errors
     /// `CameraNotFound`; `NoModel` if there is a box and no active model; `TooLarge` beyond the
     /// limit of observations.
-    pub async fn fuse_batch(
+    pub async fn fuse(
         &self,
         camera: Arc<ActiveCamera>,
         observations: &[Observation],
     ) -> Result<Vec<FusedFix>> {
-        self.check_batch(observations.len())?;
+        self.limits.check_batch(observations.len())?;
         let mut camera = camera;
         if camera.model.is_none()
             && camera.model_fault.is_none()
             && observations.iter().any(|observation| observation.bounding_box().is_some())
         {
             // A run may have ended a moment ago, here or in another process.
-            camera = self.registry.refresh_camera(&self.store, &camera.id).await?;
+            camera = self.registry.refresh_camera(self.store, &camera.id).await?;
         }
         let regressor = camera.model().map(|(regressor, _)| regressor);
         let observed: Vec<_> = observations
@@ -44,35 +75,9 @@ impl App {
             })
             .collect::<Result<Vec<_>>>()?;
         self.metrics.fused(&fused);
-        self.hand_over_last(&camera, &observed);
+        let bounds = self.limits.live_time_bounds(self.clock.now());
+        self.residuals.hand_over_last(&camera, &observed, bounds);
         Ok(fused)
-    }
-
-    /// Checks the length of a batch, before its items are read.
-    ///
-    /// # Errors
-    /// `TooLarge` and, for none at all, `InvalidArgument`, naming the field `observations`.
-    pub fn check_batch(&self, observations: usize) -> Result<()> {
-        if observations == 0 {
-            return Err(Error::invalid("observations", "must be one or more"));
-        }
-        let most = self.limits.batch_observations;
-        if observations > most {
-            return Err(Error::field(
-                ErrorKind::TooLarge,
-                "observations",
-                format!("are {observations}, at most {most} go into one request; send several"),
-            ));
-        }
-        Ok(())
-    }
-
-    /// The active camera of an id; looks into the store for one that another process has made.
-    ///
-    /// # Errors
-    /// `PermissionDenied` if the caller is a device of other cameras; `CameraNotFound`; a fault of the store.
-    pub async fn active_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
-        self.registry.active_camera(&self.store, self.caller(), id).await
     }
 }
 

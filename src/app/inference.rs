@@ -3,7 +3,9 @@
 use std::sync::Arc;
 
 use super::App;
+use super::active_cameras::ActiveCameras;
 use super::registry::ActiveCamera;
+use crate::config::Limits;
 use crate::domain::{BoundingBox, CameraId, Error, ErrorKind, Result};
 
 /// The input: one row per box.
@@ -75,7 +77,22 @@ pub struct Inferred {
     pub outputs: Vec<(OutputTensor, Vec<f64>)>,
 }
 
+/// Inference with tensors, by active models.
+#[derive(Clone, Copy)]
+pub struct Inference<'a> {
+    cameras: ActiveCameras<'a>,
+    limits: &'a Limits,
+}
+
 impl App {
+    /// Inference with tensors, by active models.
+    #[must_use]
+    pub fn inference(&self) -> Inference<'_> {
+        Inference { cameras: self.active_cameras(), limits: &self.limits }
+    }
+}
+
+impl Inference<'_> {
     /// The camera whose active model answers, and that model's version.
     ///
     /// # Errors
@@ -85,7 +102,7 @@ impl App {
         id: &CameraId,
         version: Option<&str>,
     ) -> Result<(Arc<ActiveCamera>, u32)> {
-        let camera = self.active_camera(id).await?;
+        let camera = self.cameras.get(id).await?;
         let Some((_, active)) = camera.model() else {
             let message = format!(
                 "camera {id} has no model that answers; train it, or activate a version that can be used"
@@ -104,7 +121,7 @@ impl App {
     /// Positions of boxes, each given as left, top, width, height, px.
     ///
     /// # Errors
-    /// As [`App::served_model`]; `InvalidArgument` naming the row that is no box of the camera's image;
+    /// As [`Inference::served_model`]; `InvalidArgument` naming the row that is no box of the camera's image;
     /// `TooLarge` beyond the limit of observations.
     pub async fn infer(
         &self,
@@ -113,7 +130,7 @@ impl App {
         boxes: &[[f64; BOX_COLUMNS]],
         outputs: &[OutputTensor],
     ) -> Result<Inferred> {
-        self.check_batch(boxes.len()).map_err(|error| error.at(BOXES))?;
+        self.limits.check_batch(boxes.len()).map_err(|error| error.at(BOXES))?;
         let (camera, version) = self.served_model(id, version).await?;
         let Some((regressor, _)) = camera.model() else { return Err(Error::fault("the model has gone")) };
         let boxes = boxes.iter().enumerate().map(|(row, &[left, top, width, height])| {

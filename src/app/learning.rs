@@ -4,15 +4,19 @@ use std::sync::Arc;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::live::LearningProgress;
+use super::live::{LearningProgress, Live};
 use super::recording::Recording;
-use super::registry::ActiveCamera;
-use super::samples::ImportOptions;
+use super::registry::{ActiveCamera, Registry};
+use super::samples::{ImportOptions, Samples};
+use super::training::Training;
 use super::{App, RunRequest};
+use crate::clock::Clock;
+use crate::config::Limits;
 use crate::domain::{
     CameraId, JobState, RecordingBounds, RecordingPart, Result, RunId, StoredSample, TrainingRun,
 };
 use crate::exchange::{read_recording, write_recording};
+use crate::store::Store;
 
 /// How far a camera has come on its way to a model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,17 +56,45 @@ pub struct Learning {
     pub training_run: Option<RunId>,
 }
 
+/// What cameras record to learn by themselves, and what becomes of it.
+#[derive(Clone, Copy)]
+pub struct Recordings<'a> {
+    store: &'a Store,
+    registry: &'a Registry,
+    live: Live<'a>,
+    samples: Samples<'a>,
+    training: Training<'a>,
+    clock: &'a Clock,
+    limits: &'a Limits,
+}
+
 impl App {
+    /// What cameras record to learn by themselves, and what becomes of it.
+    #[must_use]
+    pub fn recordings(&self) -> Recordings<'_> {
+        Recordings {
+            store: &self.store,
+            registry: &self.registry,
+            live: self.live(),
+            samples: self.samples(),
+            training: self.training(),
+            clock: &self.clock,
+            limits: &self.limits,
+        }
+    }
+}
+
+impl Recordings<'_> {
     /// The recording that a camera learns from, and what is missing in it.
     ///
     /// # Errors
     /// `CameraNotFound`, `CameraOnOtherNode`, `CameraBetweenNodes`.
     pub async fn learning(&self, id: &CameraId) -> Result<Learning> {
-        let mut camera = self.readable_camera(id).await?;
+        let mut camera = self.live.readable_camera(id).await?;
         let run = self.store.runs(id, None, 1).await?.pop();
         if camera.model.is_none() && run.as_ref().is_some_and(|run| run.state == JobState::Succeeded) {
             // Its version may have become active since the camera was read.
-            camera = self.registry.refresh_camera(&self.store, id).await?;
+            camera = self.registry.refresh_camera(self.store, id).await?;
         }
         if camera.is_learning() {
             self.complete_extent(&camera).await?;
@@ -87,7 +119,7 @@ impl App {
     ///
     /// # Errors
     /// A fault of the store, or `InsufficientStorage`; what was to be stored is lost.
-    pub async fn store_recordings(&self) -> Result<()> {
+    pub async fn store_pending(&self) -> Result<()> {
         for camera in self.registry.select(|camera| camera.live.learning.is_pending()) {
             if !camera.is_learning() {
                 camera.live.learning.reset();
@@ -112,13 +144,13 @@ impl App {
     ///
     /// # Errors
     /// A fault of the store.
-    pub async fn retain_recordings(&self) -> Result<()> {
+    pub async fn retain(&self) -> Result<()> {
         let age = SignedDuration::from_hours(self.limits.recording_hours.into());
         let since = self.clock.now().checked_sub(age).unwrap_or(Timestamp::MIN);
         self.store.retain_recordings(since).await.map(drop)
     }
 
-    /// A camera whose recording is to be matched now, if there is one; [`App::end_learning`] ends that.
+    /// A camera whose recording is to be matched now, if there is one; [`Recordings::end_learning`] ends that.
     #[must_use]
     pub fn begin_learning(&self) -> Option<Arc<ActiveCamera>> {
         let ready = |camera: &ActiveCamera| {
@@ -151,14 +183,14 @@ impl App {
     /// Stores samples of matched boxes and starts a training run on them.
     ///
     /// # Errors
-    /// As an import of samples, and as [`Training::start`](super::Training::start).
+    /// As an import of samples, and as [`Training::start`].
     pub async fn train_on_matched(
         &self,
         id: &CameraId,
         samples: Vec<StoredSample>,
     ) -> Result<TrainingRun<CameraId>> {
-        self.samples().store_paired(id, samples, ImportOptions::default()).await?;
-        self.training().start(id, RunRequest::default(), None).await
+        self.samples.store_paired(id, samples, ImportOptions::default()).await?;
+        self.training.start(id, RunRequest::default(), None).await
     }
 
     /// Reads what an earlier run of the server, or another node, has recorded.

@@ -6,6 +6,7 @@
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 pub mod access;
+mod active_cameras;
 mod audit;
 mod camera_statuses;
 mod cameras;
@@ -14,6 +15,7 @@ mod connections;
 mod demonstration;
 mod evaluations;
 mod fusion;
+mod history;
 mod idempotency;
 mod inference;
 mod keys;
@@ -23,6 +25,7 @@ mod matching;
 mod models;
 mod paired_import;
 mod pictures;
+mod places;
 mod recording;
 mod registry;
 mod retention;
@@ -49,27 +52,38 @@ use crate::config::{Config, Limits, Secret};
 use crate::store::{Location, Store, StoreLimits};
 use crate::telemetry::Metrics;
 
-pub use camera_statuses::CameraStatus;
+pub use audit::AuditLog;
+pub use camera_statuses::{CameraStatus, CameraStatuses};
 pub use cameras::Cameras;
-pub use cluster::{CameraLease, Cluster, ConnectionLease, DatabaseHistory, NodeSettings, NodeStatus, Watch};
+pub use cluster::{
+    CameraLease, Cluster, ConnectionLease, DatabaseHistory, NodeSettings, NodeStatus, Nodes, Watch,
+};
 pub use connections::{
-    ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, CountedReason,
-    LastMessage, LiveConnection, PushedMessage, ReportedStatuses, connection_groups, connection_settings,
+    ConnectionBoard, ConnectionNode, ConnectionRequest, ConnectionState, ConnectionStatus, Connections,
+    CountedReason, LastMessage, LiveConnection, Outboxes, PushedMessage, ReportedStatuses, connection_groups,
+    connection_settings,
 };
 pub use demonstration::{Demonstration, DemonstrationParts};
 pub use evaluations::{DEFAULT_TEST_SHARE, EvaluationRequest, Evaluations};
-pub use inference::{BOX_COLUMNS, BOXES, Inferred, OutputTensor};
+pub use fusion::Fusion;
+pub use history::{ArchivedHistory, HeatCell, HeatMap, History, HistoryRows, HistorySelection};
+pub use inference::{BOX_COLUMNS, BOXES, Inference, Inferred, OutputTensor};
 pub use keys::Keys;
-pub use learning::{Learning, LearningState};
+pub use learning::{Learning, LearningState, Recordings};
 pub use live::{
-    Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult,
-    LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, SinkFeed, SinkFeeds,
-    SinkPosition, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent, TargetUpdate,
-    TrackPoint, UnplacedBox, WantedPositions, WorldSighting, WorldTrackPoint,
+    Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult, Live,
+    LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, Retraining, SinkFeed,
+    SinkFeeds, SinkPosition, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent, TargetUpdate,
+    TrackPoint, UnplacedBox, WantedEvents, WantedPositions, WorldSighting, WorldTrackPoint, WorldTracks,
 };
 pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
 pub use models::{GnssErrorEstimate, Models};
 pub use paired_import::{PairedImport, PairedReport};
+pub use pictures::Pictures;
+pub use places::{
+    PlaceEvents, PlaceMonitor, PlaceStatistics, Places, StatisticsInterval, StatisticsRequest,
+    StatisticsStep, StoredEvent, event_kind, place_settings,
+};
 pub use recording::{PairingCounts, Part, Recording, RecordingLimits, RejectedParts, of_part};
 pub use registry::{ActiveCamera, ModelFault, ModelSummary, Registry};
 pub use retention::{ClockDoubt, Retention, retention_doubt};
@@ -101,6 +115,8 @@ pub struct Parts {
     pub connection_board: ConnectionBoard,
     /// Positions that wait for the outboxes of their sinks.
     pub sink_feeds: SinkFeeds,
+    /// The way of finished tracks to the archive.
+    pub archived_history: ArchivedHistory,
     /// Where their sinks write files, if they may: set by the server at its start.
     pub export_folder: OnceLock<PathBuf>,
     /// Serial devices that their sources may read: set by the server at its start.
@@ -132,10 +148,12 @@ pub struct Parts {
     stream_slots: live::StreamSlots,
     /// Rounds of live matching.
     matching_slot: live::MatchingSlot,
+    /// Places, and the tracks there.
+    place_monitor: Arc<PlaceMonitor>,
     /// The way to the drift detectors.
     residuals: live::ResidualQueue,
     /// When moved cameras are trained again.
-    retraining: live::RetrainSchedule,
+    retrain_schedule: live::RetrainSchedule,
     /// Tasks that answers hand work to; [`App::close`] waits for them.
     tasks: TaskTracker,
 }
@@ -163,6 +181,9 @@ impl App {
         access.refresh(&store, &clock).await?;
         let pairings = Arc::new(Semaphore::new(limits.pairings));
         let (residuals, waiting) = live::residual_queue();
+        let (archived_history, finished_tracks) = ArchivedHistory::new(&limits, metrics.clone());
+        let max_tracks = limits.tracks_per_camera.max(limits.tracks_per_site);
+        let (place_monitor, measured) = PlaceMonitor::new(limits.place_queue, max_tracks, metrics.clone());
         let quotas = Arc::new(Quotas::new(&limits));
         let parts = Parts {
             opened_store: store,
@@ -170,6 +191,7 @@ impl App {
             site_registry,
             connection_board: ConnectionBoard::default(),
             sink_feeds: SinkFeeds::new(randomness.uuid_v7(clock.now())),
+            archived_history,
             export_folder: OnceLock::new(),
             serial_devices: OnceLock::new(),
             access,
@@ -186,12 +208,15 @@ impl App {
             cluster: Cluster::default(),
             stream_slots: live::StreamSlots::default(),
             matching_slot: live::MatchingSlot::default(),
+            place_monitor,
             residuals,
-            retraining: live::RetrainSchedule::default(),
+            retrain_schedule: live::RetrainSchedule::default(),
             tasks: TaskTracker::new(),
         };
         let app = Self::of_program(Arc::new(parts), "sightfix");
         app.tasks.spawn(waiting.run(Arc::downgrade(&app.parts)));
+        app.tasks.spawn(measured.run(Arc::downgrade(&app.parts)));
+        tokio::spawn(history::write_finished_tracks(finished_tracks, Arc::downgrade(&app.parts)));
         Ok(app)
     }
 
@@ -214,15 +239,6 @@ impl App {
         &self.caller
     }
 
-    /// Brings sites and cameras up to date, including changes of other processes.
-    ///
-    /// # Errors
-    /// A fault if the store cannot be read.
-    pub async fn refresh_registries(&self) -> crate::domain::Result<()> {
-        self.site_registry.refresh(&self.store).await?;
-        self.registry.refresh(&self.store).await
-    }
-
     /// Waits for the work that answers have handed over, then closes the store. Streams must have ended.
     pub async fn close(&self) {
         if let Err(error) = self.access.store_last_uses(&self.store).await {
@@ -230,11 +246,13 @@ impl App {
         }
         self.residuals.close();
         self.site_registry.close();
+        self.place_monitor.close();
         self.tasks.close();
         if tokio::time::timeout(CLOSE_TIME, self.tasks.wait()).await.is_err() {
             tracing::warn!("samples or residuals of live streams were still under way at the end");
         }
-        self.close_outbox_logs().await;
+        self.history().finish().await;
+        self.outboxes().close_logs().await;
         self.store.close().await;
     }
 }
@@ -269,6 +287,10 @@ pub const fn store_limits(limits: &Limits) -> StoreLimits {
     StoreLimits {
         cameras: limits.cameras,
         sites: limits.sites,
+        places: limits.places,
+        place_events: limits.place_events,
+        place_minute_days: limits.place_minute_days,
+        place_hour_days: limits.place_hour_days,
         outside_connections: limits.outside_connections,
         outbox_messages: limits.outbox_messages,
         dead_letters: limits.dead_letters,

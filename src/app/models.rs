@@ -3,7 +3,7 @@
 use bytes::Bytes;
 use jiff::Timestamp;
 
-use super::access::Caller;
+use super::active_cameras::ActiveCameras;
 use super::registry::{ModelFault, Registry, load_model, unusable};
 use super::{App, Page, page_of};
 use crate::clock::Clock;
@@ -197,14 +197,19 @@ pub struct Models<'a> {
     store: &'a Store,
     registry: &'a Registry,
     clock: &'a Clock,
-    caller: &'a Caller,
+    cameras: ActiveCameras<'a>,
 }
 
 impl App {
     /// The use cases of model versions.
     #[must_use]
     pub fn models(&self) -> Models<'_> {
-        Models { store: &self.store, registry: &self.registry, clock: &self.clock, caller: &self.caller }
+        Models {
+            store: &self.store,
+            registry: &self.registry,
+            cameras: self.active_cameras(),
+            clock: &self.clock,
+        }
     }
 }
 
@@ -251,7 +256,7 @@ impl Models<'_> {
     /// `CameraNotFound`; `InvalidArgument` naming what in the file cannot be used, or the check that its
     /// answers do not pass.
     pub async fn import(&self, id: &CameraId, file: &[u8]) -> Result<ModelVersion> {
-        self.registry.active_camera(self.store, self.caller, id).await?;
+        self.cameras.get(id).await?;
         let artifact = Artifact::from_file(file)?;
         artifact.load()?;
         self.store.insert_model(id, &artifact.metadata, &artifact.weights, self.clock.now()).await

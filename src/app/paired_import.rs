@@ -93,7 +93,7 @@ impl Samples<'_> {
         import: PairedImport<impl Read + Send + 'static, impl Read + Send + 'static>,
     ) -> Result<PairedReport> {
         let rules = self.row_rules(id).await?;
-        let active = self.active_camera(id).await?;
+        let active = self.cameras.get(id).await?;
         let camera = CameraContext {
             receivers: active.receivers.clone(),
             regressor: active.model.as_ref().map(|(regressor, _)| regressor.clone()),

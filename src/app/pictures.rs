@@ -5,9 +5,12 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use super::App;
+use super::active_cameras::ActiveCameras;
 use super::live::sync::lock;
+use crate::clock::Clock;
 use crate::domain::{CameraId, Error, ErrorKind, NewCamera, Picture, Result, SnapshotSource};
 use crate::exchange::Address;
+use crate::store::Store;
 
 /// Least time between two requests to the snapshot address of a camera.
 const SNAPSHOT_PAUSE: Duration = Duration::from_secs(2);
@@ -42,12 +45,34 @@ pub(super) fn check_snapshot(profile: &NewCamera) -> Result<()> {
     address.transpose().map(drop).map_err(|error| error.at("snapshot.url"))
 }
 
+/// Pictures of what cameras see.
+#[derive(Clone, Copy)]
+pub struct Pictures<'a> {
+    cameras: ActiveCameras<'a>,
+    store: &'a Store,
+    clock: &'a Clock,
+    snapshot_times: &'a SnapshotTimes,
+}
+
 impl App {
+    /// Pictures of what cameras see.
+    #[must_use]
+    pub fn pictures(&self) -> Pictures<'_> {
+        Pictures {
+            cameras: self.active_cameras(),
+            store: &self.store,
+            clock: &self.clock,
+            snapshot_times: &self.snapshot_times,
+        }
+    }
+}
+
+impl Pictures<'_> {
     /// The picture of what a camera sees; `None` if nobody has set one.
     ///
     /// # Errors
     /// `CameraNotFound`.
-    pub async fn picture(&self, id: &CameraId) -> Result<Option<Picture>> {
+    pub async fn get(&self, id: &CameraId) -> Result<Option<Picture>> {
         self.store.picture(id).await
     }
 
@@ -57,7 +82,7 @@ impl App {
     /// `CameraNotFound`; `InvalidArgument` if its profile has none; `PermissionDenied` for a device of other cameras;
     /// `RateLimited`.
     pub async fn begin_snapshot(&self, id: &CameraId) -> Result<SnapshotSource> {
-        self.active_camera(id).await?;
+        self.cameras.get(id).await?;
         let missing = || Error::invalid("snapshot", "is missing in the profile of the camera; set its url");
         let source = self.store.camera(id).await?.profile.snapshot.ok_or_else(missing)?;
         self.snapshot_times.take(id, self.clock.monotonic())?;
@@ -68,8 +93,8 @@ impl App {
     ///
     /// # Errors
     /// `CameraNotFound`; `PermissionDenied` for a device of other cameras; `InsufficientStorage`.
-    pub async fn set_picture(&self, id: &CameraId, picture: Option<&Picture>) -> Result<()> {
-        self.active_camera(id).await?;
+    pub async fn set(&self, id: &CameraId, picture: Option<&Picture>) -> Result<()> {
+        self.cameras.get(id).await?;
         self.store.set_picture(id, picture, self.clock.now()).await
     }
 }

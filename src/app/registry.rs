@@ -11,11 +11,10 @@ use arc_swap::ArcSwap;
 use jiff::Timestamp;
 use tokio::sync::Mutex;
 
-use super::access::Caller;
 use super::live::camera::CameraLive;
 use crate::domain::{
-    CameraId, CameraKey, CameraMoved, Error, ErrorKind, GnssError, HeldOutError, ImageSize, ModelMetadata,
-    Receivers, Result, Revision, SiteId, TimeBounds,
+    CameraId, CameraKey, CameraMoved, Error, ErrorKind, GnssError, HeldOutError, HistorySettings, ImageSize,
+    ModelMetadata, Receivers, Result, Revision, SiteId, TimeBounds,
 };
 use crate::exchange::RowRules;
 use crate::model::{Artifact, Regressor, ViewArea};
@@ -26,8 +25,8 @@ const READ_AT_ONCE: usize = 256;
 /// Loaded cameras that a refresh shows at once. Every change copies the map, so that few at a time would cost the square
 /// of their number at the start of a server.
 const SHOWN_AT_ONCE: usize = 4_096;
-/// A refresh reads what has changed since the one before; one of so many compares all cameras, whatever a server that
-/// was restored, copied or replaced says of its changes.
+/// A refresh reads what has changed since the one before. One in this number of refreshes compares all cameras, since a
+/// server that was restored, copied or replaced may not tell all of its changes.
 const REFRESHES_OF_CHANGES: u32 = 150;
 
 /// Everything that answers for one camera.
@@ -51,6 +50,8 @@ pub struct ActiveCamera {
     pub learn_automatically: bool,
     /// The site whose tracks the camera contributes to.
     pub site: Option<SiteId>,
+    /// How finished tracks are kept; `None` keeps none.
+    pub history: Option<HistorySettings>,
     /// The movement that the drift detector found with that model.
     pub moved: Option<Arc<CameraMoved>>,
     /// The active model and its version number.
@@ -127,6 +128,11 @@ impl Registry {
         self.run_id.wrapping_add(key.0.cast_unsigned())
     }
 
+    /// All cameras, by id.
+    pub(super) fn all(&self) -> Arc<HashMap<CameraId, Arc<ActiveCamera>>> {
+        self.cameras.load_full()
+    }
+
     /// Returns the active camera of an id.
     #[must_use]
     pub fn get(&self, id: &CameraId) -> Option<Arc<ActiveCamera>> {
@@ -141,23 +147,6 @@ impl Registry {
     /// The first camera that a rule selects; it is asked of no camera after that.
     pub(super) fn find(&self, rule: impl Fn(&ActiveCamera) -> bool) -> Option<Arc<ActiveCamera>> {
         self.cameras.load().values().find(|camera| rule(camera)).cloned()
-    }
-
-    /// The active camera of an id; looks into the store for one that another process has made.
-    ///
-    /// # Errors
-    /// `PermissionDenied` if the caller is a device of other cameras; `CameraNotFound`; a fault of the store.
-    pub(super) async fn active_camera(
-        &self,
-        store: &Store,
-        caller: &Caller,
-        id: &CameraId,
-    ) -> Result<Arc<ActiveCamera>> {
-        caller.authorize_camera(id)?;
-        match self.get(id) {
-            Some(camera) => Ok(camera),
-            None => self.refresh_camera(store, id).await,
-        }
     }
 
     /// Brings one camera up to date with the store.
@@ -386,6 +375,7 @@ impl Registry {
             retrain_when_moved: camera.profile.retrain_when_moved,
             learn_automatically: camera.profile.learn_automatically,
             site: camera.profile.site,
+            history: camera.profile.history,
             receivers: camera.profile.receivers,
             model,
             model_summary,

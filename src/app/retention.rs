@@ -7,7 +7,7 @@ use std::fmt;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::App;
+use super::samples::Samples;
 use crate::clock::Clock;
 use crate::domain::Result;
 use crate::store::Store;
@@ -67,15 +67,15 @@ fn days(days: u32) -> SignedDuration {
     SignedDuration::from_hours(24 * i64::from(days))
 }
 
-impl App {
+impl Samples<'_> {
     /// Deletes the samples that are older than `limits.sample_days`, and prepares the store for those of the time to come.
     ///
     /// # Errors
     /// The store cannot be read or written; the next call goes on.
-    pub async fn retain_samples(&self) -> Result<Retention> {
+    pub async fn retain(&self) -> Result<Retention> {
         let sample_days = self.limits.sample_days;
         let now = self.store.time(self.clock.now()).await?;
-        let doubt = retention_doubt(&self.store, &self.clock, sample_days).await?;
+        let doubt = retention_doubt(self.store, self.clock, sample_days).await?;
         let is_wanted = sample_days > 0 && doubt.is_none();
         let since = is_wanted.then(|| now.checked_sub(days(sample_days)).ok()).flatten();
         let deleted = self.store.retain_samples(since, now).await?;

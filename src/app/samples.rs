@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::{Semaphore, mpsc};
 
 use super::access::{Caller, Permission};
+use super::active_cameras::ActiveCameras;
 use super::idempotency::{first_answer, record_of, stored_answer};
-use super::registry::{ActiveCamera, Registry};
 use super::swapped_columns::PlaceCheck;
 use super::{App, Page, page_of};
 use crate::clock::Clock;
@@ -89,8 +89,8 @@ impl ImportReport {
 #[derive(Clone, Copy)]
 pub struct Samples<'a> {
     pub(super) store: &'a Store,
-    registry: &'a Registry,
-    clock: &'a Clock,
+    pub(super) cameras: ActiveCameras<'a>,
+    pub(super) clock: &'a Clock,
     pub(super) limits: &'a Limits,
     pub(super) metrics: &'a Metrics,
     pub(super) pairings: &'a Arc<Semaphore>,
@@ -103,7 +103,7 @@ impl App {
     pub fn samples(&self) -> Samples<'_> {
         Samples {
             store: &self.store,
-            registry: &self.registry,
+            cameras: self.active_cameras(),
             clock: &self.clock,
             limits: &self.limits,
             metrics: &self.metrics,
@@ -114,14 +114,6 @@ impl App {
 }
 
 impl Samples<'_> {
-    /// The camera that a caller means.
-    ///
-    /// # Errors
-    /// As [`App::active_camera`].
-    pub(super) async fn active_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
-        self.registry.active_camera(self.store, self.caller, id).await
-    }
-
     /// Stores the rows of a file. One bad row never loses the others; what is counted as accepted
     /// is committed.
     ///
@@ -169,7 +161,7 @@ impl Samples<'_> {
         rows: impl Stream<Item = Result<Result<StoredSample, RowError>>> + Send,
         options: ImportOptions,
     ) -> Result<ImportReport> {
-        self.active_camera(id).await?;
+        self.cameras.get(id).await?;
         let mut batches = std::pin::pin!(rows.ready_chunks(BATCH_ROWS));
         if let Some(request) = &options.idempotent
             && stored_answer(self.store, self.clock, request).await?.is_some()
@@ -218,7 +210,7 @@ impl Samples<'_> {
     /// # Errors
     /// `CameraNotFound`.
     pub async fn row_rules(&self, id: &CameraId) -> Result<RowRules> {
-        Ok(self.active_camera(id).await?.row_rules(self.clock.now()))
+        Ok(self.cameras.get(id).await?.row_rules(self.clock.now()))
     }
 
     /// Samples by time and target, after a cursor.
@@ -326,7 +318,7 @@ impl<'a> Import<'a> {
                 Err(row) => self.reject(row),
             }
         }
-        let camera = self.samples.active_camera(self.id).await?;
+        let camera = self.samples.cameras.get(self.id).await?;
         self.places.see(self.samples.store, &camera, &samples).await?;
         if is_last {
             self.report.warnings = self.places.warnings();

@@ -9,7 +9,7 @@ use tokio::sync::Mutex;
 
 use super::live::site::state::SiteLive;
 use crate::clock::Randomness;
-use crate::domain::{ErrorKind, Result, Revision, Site, SiteId, SiteKey};
+use crate::domain::{ErrorKind, Result, Revision, Site, SiteId, SiteKey, TrackScope};
 use crate::store::Store;
 
 /// A site that exists.
@@ -142,6 +142,8 @@ impl SiteRegistry {
             |known| known.live.clone(),
         );
         live.set_origin(site.profile.origin);
+        let scope = || TrackScope::Site(site.id().clone());
+        live.set_history(site.profile.history.map(|settings| (scope(), settings)));
         let site = (site.id().clone(), Arc::new(ActiveSite { key: site.key, revision: site.revision, live }));
         self.sites.rcu(|sites| {
             let mut sites = HashMap::clone(sites);

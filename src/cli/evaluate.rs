@@ -12,6 +12,7 @@ use super::import::{gnss_bias_sigma, image_size};
 use super::output::{print_line, print_note};
 use super::progress::Progress;
 use super::recordings;
+use super::rejected_rows::RejectedRows;
 use crate::clock::{Clock, process_cpu_s};
 use crate::domain::{
     Detection, GnssBiasSigma, ImageSize, Recipe, Sample, SigmaM, StoredSample, TargetId, TimeBounds,
@@ -24,8 +25,6 @@ use crate::geo::Position;
 use crate::model::FitInput;
 use crate::paper_experiments::{self, RealRecording, Recordings, Worlds};
 
-/// Invalid rows that are reported individually.
-const MAX_REPORTED_ROWS: u64 = 20;
 /// Largest number of seeds of one evaluation.
 const MAX_SEEDS: u64 = 100;
 /// Largest seed of the first draw; the known models have the seeds from a million on.
@@ -299,27 +298,14 @@ fn read_test(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Vec<T
 fn read(path: &Path, image_size: Option<ImageSize>) -> anyhow::Result<Vec<ObservedRow>> {
     let rules = RowRules { time_bounds: TimeBounds::at(Clock::system().now()), image_size };
     let mut rows = Vec::new();
-    let mut invalid = 0_u64;
+    let mut rejected = RejectedRows::default();
     for row in exchange::read_observations(files::open_input(path)?, files::format_of(path, None)?, &rules)? {
         match row.with_context(|| format!("cannot read {}", path.display()))? {
             Ok(row) => rows.push(row),
-            Err(error) => {
-                invalid += 1;
-                if invalid <= MAX_REPORTED_ROWS {
-                    print_note(format_args!(
-                        "{}: line {}: {}: {}",
-                        path.display(),
-                        error.line,
-                        error.field,
-                        error.reason
-                    ));
-                }
-            }
+            Err(row) => rejected.push(row),
         }
     }
-    if invalid > MAX_REPORTED_ROWS {
-        print_note(format_args!("{}: and {} more invalid rows", path.display(), invalid - MAX_REPORTED_ROWS));
-    }
+    rejected.print(&format!("{}: ", path.display()));
     Ok(rows)
 }
 

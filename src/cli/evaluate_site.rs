@@ -7,8 +7,8 @@ use super::progress::Progress;
 use super::site_recording;
 use crate::domain::ImageSize;
 use crate::evaluation::site::{
-    Degradation, Identities, MatchingReport, SiteCase, SiteOutcome, SiteRecording, SiteReport, SiteTraining,
-    TrainedSite, track_site, train_site,
+    Degradation, Identities, KNOWN_MODEL_SEEDS, MatchingReport, SiteCase, SiteOutcome, SiteRecording,
+    SiteReport, SiteTraining, TrainedSite, track_site, train_site,
 };
 
 /// Number of draws and the seed of the first; without any, the recording is taken as it is.
@@ -20,6 +20,11 @@ pub(super) struct Draws {
 }
 
 impl Draws {
+    /// True if carriers are drawn, so that each draw has other phones.
+    const fn carriers(&self) -> bool {
+        self.count > 0 && !self.only_errors
+    }
+
     fn of(&self, recording: &SiteRecording, draw: u64) -> SiteRecording {
         let seed = self.first_seed + draw;
         match (self.count, self.only_errors) {
@@ -37,7 +42,10 @@ pub(super) fn evaluate(
     draws: &Draws,
 ) -> anyhow::Result<SiteReport> {
     let recording = site_recording::read(folder, image_size)?;
-    let cases = cases(&recording);
+    let mut cases = cases(&recording);
+    if draws.carriers() {
+        cases.extend(cases_of_other_phones(&cases[0]));
+    }
     let mut outcomes: Vec<Vec<SiteOutcome>> = vec![Vec::new(); cases.len()];
     let mut progress = Progress::new("{spinner} {pos}/{len} {msg}");
     let count = draws.count.max(1);
@@ -47,9 +55,18 @@ pub(super) fn evaluate(
             [SiteTraining::Together, SiteTraining::Apart].map(|training| train_site(&drawn, training));
         let [together, apart] = trained;
         let (together, apart) = (together?, apart?);
+        // The fixes that are matched with tracks must not be those by which the cameras were trained.
+        let of_other_phones = draws.carriers().then(|| draws.of(&recording, draw + KNOWN_MODEL_SEEDS));
+        let of_other_phones =
+            of_other_phones.map(|it| train_site(&it, SiteTraining::Together)).transpose()?;
+        let of_other_phones = of_other_phones.as_ref().unwrap_or(&together);
         for (case, outcomes) in cases.iter().zip(&mut outcomes) {
             progress.set(draw, count, &case.name);
-            let trained = if case.training == SiteTraining::Together { &together } else { &apart };
+            let trained = match (case.phones, case.training) {
+                (Phones::OfTraining, SiteTraining::Together) => &together,
+                (Phones::OfTraining, SiteTraining::Apart) => &apart,
+                (Phones::Other | Phones::OtherMatched, _) => of_other_phones,
+            };
             outcomes.push(case.run(&drawn, trained, draws.first_seed + draw));
         }
     }
@@ -67,7 +84,10 @@ pub(super) fn evaluate(
             })
             .collect(),
     };
-    print_line(&report.table().trim_end())?;
+    let mut tables =
+        vec![report.table(), report.named_table(), report.crossing_table(), report.count_table()];
+    tables.retain(|table| !table.is_empty());
+    print_line(&tables.join("\n").trim_end())?;
     Ok(report)
 }
 
@@ -91,19 +111,33 @@ pub(super) fn evaluate_matching(
 }
 
 /// One row of the table.
+#[derive(Clone)]
 struct Case {
     name: String,
     training: SiteTraining,
     identities: Identities,
     degradation: Option<Degradation>,
     cameras: Vec<usize>,
+    phones: Phones,
+}
+
+/// The phones of a case.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phones {
+    /// Those by which the cameras were trained.
+    OfTraining,
+    /// The cameras were trained by the phones of another draw.
+    Other,
+    /// The same, and the fixes of the draw come beside its boxes.
+    OtherMatched,
 }
 
 impl Case {
     fn run(&self, recording: &SiteRecording, trained: &TrainedSite, seed: u64) -> SiteOutcome {
         let degraded = self.degradation.map(|degradation| degradation.apply(recording, seed));
         let boxes = degraded.as_ref().unwrap_or(recording);
-        track_site(boxes, recording, trained, self.identities, &self.cameras)
+        let with_fixes = self.phones == Phones::OtherMatched;
+        track_site(boxes, recording, trained, self.identities, &self.cameras, with_fixes)
     }
 }
 
@@ -116,6 +150,7 @@ fn cases(recording: &SiteRecording) -> Vec<Case> {
         identities,
         degradation,
         cameras: all.clone(),
+        phones: Phones::OfTraining,
     };
     let rough = Some(Degradation::ROUGH);
     let mut cases = vec![
@@ -130,4 +165,13 @@ fn cases(recording: &SiteRecording) -> Vec<Case> {
         ..case(&format!("camera {} alone", recorded.id), SiteTraining::Apart, Identities::Tracked, None)
     }));
     cases
+}
+
+/// All cameras trained together by the phones of another draw, without fixes and with them.
+fn cases_of_other_phones(together: &Case) -> [Case; 2] {
+    [
+        ("trained together by other phones", Phones::Other),
+        ("the same, with phones beside the boxes", Phones::OtherMatched),
+    ]
+    .map(|(name, phones)| Case { name: name.to_owned(), phones, ..together.clone() })
 }

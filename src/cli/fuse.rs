@@ -6,7 +6,7 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::files::{self, Output};
-use super::output::print_note;
+use super::rejected_rows::RejectedRows;
 use super::summary::SummaryFlags;
 use super::{DataFolder, MissingData, camera_id, open_app, runtime};
 use crate::clock::Clock;
@@ -65,13 +65,12 @@ impl Fuse {
         let cannot_write = || format!("cannot write {}", self.out.display());
         let mut out = Output::create(&self.out)?;
         let mut writer = exchange::FusedWriter::new(&mut out, to);
-        let (mut answered, mut rejected) = (0_u64, 0_u64);
+        let (mut answered, mut rejected) = (0_u64, RejectedRows::default());
         for row in rows {
             let row = match row? {
                 Ok(row) => row,
                 Err(row) => {
-                    rejected += 1;
-                    print_note(format_args!("line {}: {}: {}", row.line, row.field, row.reason));
+                    rejected.push(row);
                     continue;
                 }
             };
@@ -84,6 +83,8 @@ impl Fuse {
         }
         writer.finish().with_context(cannot_write)?;
         out.finish().with_context(cannot_write)?;
+        rejected.print("");
+        let rejected = rejected.count;
         let summary = self.summary.summary(Some(&self.out));
         summary.document(&serde_json::json!({ "answered": answered, "rejected": rejected }))?;
         summary.line(&format_args!("answered {answered}, rejected {rejected}"))

@@ -6,7 +6,7 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::files;
-use super::output::print_note;
+use super::rejected_rows::print_reasons;
 use super::summary::SummaryFlags;
 use crate::app::GnssErrorEstimate;
 use crate::clock::Clock;
@@ -36,9 +36,7 @@ impl EstimateGnssError {
         let time_bounds = TimeBounds::at(Clock::system().now());
         let rows = exchange::read_fixes(files::open_input(&self.file)?, format, time_bounds)?;
         let estimate = GnssErrorEstimate::from_rows(rows, Limits::default().rejected_rows)?;
-        for row in &estimate.rejected_rows {
-            print_note(format_args!("line {}: {}: {}", row.line, row.field, row.reason));
-        }
+        print_reasons("", &estimate.rejected_rows, estimate.rejected);
         let (longitude_deg, latitude_deg) = (estimate.mean.longitude_deg(), estimate.mean.latitude_deg());
         let summary = self.summary.summary(None);
         summary.document(&serde_json::json!({

@@ -8,6 +8,7 @@ use clap::Args;
 use super::exit_code::TooManyRejected;
 use super::layout::LayoutFlags;
 use super::progress::Progress;
+use super::rejected_rows;
 use super::summary::{Summary, SummaryFlags};
 use super::{DataFolder, MissingData, camera_id, files, open_app, runtime, site_id, target_id};
 use crate::app::{App, ImportOptions, ImportReport};
@@ -160,8 +161,8 @@ fn print(report: &ImportReport, summary: &Summary) -> anyhow::Result<()> {
     if *replaced > 0 {
         summary.line(&format_args!("replaced {replaced}"))?;
     }
-    for row in rejected_rows {
-        summary.line(&format_args!("line {}: {}: {}", row.line, row.field, row.reason))?;
+    for reason in rejected_rows::reasons(rejected_rows) {
+        summary.line(&reason)?;
     }
     if *rejected > rejected_rows.len() as u64 {
         summary.line(&format_args!("... and {} more", rejected - rejected_rows.len() as u64))?;

@@ -24,6 +24,7 @@ mod output;
 mod pair;
 mod progress;
 mod recordings;
+mod rejected_rows;
 mod replay;
 mod restore;
 mod serve;

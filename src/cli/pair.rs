@@ -13,6 +13,7 @@ use super::files::{self, Output};
 use super::import::image_size;
 use super::layout::LayoutFlags;
 use super::output::print_note;
+use super::rejected_rows::print_reasons;
 use super::summary::{Summary, SummaryFlags};
 use super::{DataFolder, MissingData, camera_id, open_app, receiver_id, runtime, target_id};
 use crate::app::{
@@ -346,8 +347,10 @@ fn carried(receiver: &Receiver) -> String {
 }
 
 fn print_rejected(summary: &Summary, rejected: &RejectedParts) -> anyhow::Result<()> {
-    for (part, row) in &rejected.rows {
-        print_note(format_args!("{} line {}: {}: {}", part.as_str(), row.line, row.field, row.reason));
+    for part in [Part::Detections, Part::Fixes] {
+        let rows: Vec<_> = rejected.rows.iter().filter(|(of, _)| *of == part).map(|(_, row)| row).collect();
+        let count = rows.len() as u64;
+        print_reasons(&format!("{} ", part.as_str()), rows, count);
     }
     let printed = rejected.rows.len() as u64;
     if rejected.count > printed {

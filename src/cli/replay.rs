@@ -11,8 +11,9 @@ use clap::{Args, value_parser};
 use jiff::SignedDuration;
 use tokio_util::sync::CancellationToken;
 
-use super::output::{print_line, print_note};
+use super::output::print_line;
 use super::progress::Progress;
+use super::rejected_rows::RejectedRows;
 use super::{camera_id, files, receiver_id, runtime, target_id};
 use crate::clock::Clock;
 use crate::config::{Config, Overrides};
@@ -224,19 +225,14 @@ impl Delivery {
 
 /// The valid rows of a file; the others are reported on standard error and skipped.
 fn rows(path: &Path, rules: &RowRules) -> anyhow::Result<Vec<LiveItem>> {
-    let mut valid = Vec::new();
+    let (mut valid, mut rejected) = (Vec::new(), RejectedRows::default());
     for row in exchange::read_live_items(files::open_input(path)?, files::format_of(path, None)?, rules)? {
         match row? {
             Ok(row) => valid.push(row),
-            Err(row) => print_note(format_args!(
-                "{}: line {}: {}: {}",
-                path.display(),
-                row.line,
-                row.field,
-                row.reason
-            )),
+            Err(row) => rejected.push(row),
         }
     }
+    rejected.print(&format!("{}: ", path.display()));
     Ok(valid)
 }
 

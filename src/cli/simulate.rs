@@ -9,7 +9,7 @@ use clap::{Args, Subcommand};
 use super::files::{self, Output};
 use super::simulate_site::SimulateSite;
 use crate::exchange::{self, Format};
-use crate::simulation::{Options, Route, Scene, TargetShape, World, simulate};
+use crate::simulation::{AirportForm, Options, Route, Scene, TargetShape, World, simulate};
 
 /// Write a simulated world with its truth
 #[derive(Args)]
@@ -24,6 +24,9 @@ pub(super) struct Simulate {
     /// .zst; - is standard output
     #[arg(long, value_name = "FILE", required = true)]
     out: Option<PathBuf>,
+    /// Camera, ground and lines of an airport: plain, telephoto, high-tower, slope, curved-runway, step or fisheye
+    #[arg(long, value_name = "FORM", default_value_t)]
+    airport_form: AirportForm,
     /// Number of training rows
     #[arg(long, value_name = "N", default_value_t = 10_000)]
     samples: usize,
@@ -63,6 +66,9 @@ pub(super) struct Simulate {
     /// Standard deviation per axis of the receivers, m [default: that of the scene]
     #[arg(long, value_name = "S")]
     gnss_sigma_m: Option<f64>,
+    /// Time constant of the receivers' error beside a white part of 0.13 m, s [default: that of the scene]
+    #[arg(long, value_name = "S")]
+    gnss_time_constant_s: Option<f64>,
     /// Standard deviation per axis of an additional error that each receiver keeps for a session, m
     #[arg(long, value_name = "S", default_value_t = 0.0)]
     gnss_bias_sigma_m: f64,
@@ -116,6 +122,7 @@ impl Simulate {
         let base = Options::new(scene);
         let target_shape = self.target_shape(scene);
         let options = Options {
+            airport_form: self.airport_form,
             seed: self.seed,
             camera_seed: self.camera_seed,
             samples: self.samples,
@@ -125,6 +132,7 @@ impl Simulate {
             sessions: self.sessions,
             target_shape,
             gnss_sigma_m: self.gnss_sigma_m.unwrap_or(base.gnss_sigma_m),
+            gnss_time_constant_s: self.gnss_time_constant_s,
             gnss_bias_sigma_m: self.gnss_bias_sigma_m,
             box_noise_px: self.box_noise_px,
             lens_distortion: self.lens_distortion,
@@ -206,6 +214,10 @@ fn check(options: &Options) -> anyhow::Result<()> {
     anyhow::ensure!((0.001..=1e4).contains(gnss_sigma_m), "--gnss-sigma-m must be from 0.001 to 10,000 m");
     anyhow::ensure!((0.0..=100.0).contains(box_noise_px), "--box-noise-px must be from 0 to 100");
     anyhow::ensure!((-0.3..=0.3).contains(lens_distortion), "--lens-distortion must be from -0.3 to 0.3");
+    anyhow::ensure!(
+        options.gnss_time_constant_s.is_none_or(|constant_s| (0.1..=1e6).contains(&constant_s)),
+        "--gnss-time-constant-s must be from 0.1 to 1,000,000 s"
+    );
     anyhow::ensure!(
         (0.0..=1e4).contains(&options.gnss_bias_sigma_m),
         "--gnss-bias-sigma-m must be from 0 to 10,000 m"

@@ -11,9 +11,10 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
-use crate::domain::SampleOverflow;
+use crate::domain::{Error, ErrorKind, Result, SampleOverflow, TimeBounds};
 
 pub use console::Console;
 pub use load::Overrides;
@@ -77,6 +78,9 @@ pub struct Config {
     /// Folder below which sinks of connections write files (`file:`), each in a folder of its own; without it there are
     /// no such sinks.
     pub export_folder: Option<PathBuf>,
+    /// Where finished tracks of cameras and sites with a history are kept: a folder, or the URL of an object store such as
+    /// `s3://bucket/prefix`; by default the folder `archive` in `data`.
+    pub archive: Option<String>,
     /// Serial devices that sources of connections may read (`serial:`), as their addresses name them.
     pub serial_devices: Vec<PathBuf>,
     /// Connections with other systems, as `POST /v1/connections` takes them; created or changed at the start.
@@ -240,6 +244,10 @@ pub struct Limits {
     pub tracks_per_camera: usize,
     /// Points of a target's track that are kept, half a second or more apart.
     pub track_points: usize,
+    /// Memory of the recorded path of one track, bytes; beyond, every second point is left out.
+    pub history_track_bytes: usize,
+    /// Finished tracks that wait for the archive; beyond, they are not kept.
+    pub history_queue: usize,
     /// Seconds that the time of a live item may be ahead of the server's clock; beyond, it is refused.
     pub live_ahead_s: u32,
     /// Live streams open at a time.
@@ -279,6 +287,16 @@ pub struct Limits {
     pub cameras: u32,
     /// Sites; more are refused.
     pub sites: u32,
+    /// Places; more are refused.
+    pub places: u32,
+    /// Measurements that wait to be compared with places; beyond, they are dropped.
+    pub place_queue: usize,
+    /// Events of all places; beyond, the oldest are deleted.
+    pub place_events: u32,
+    /// Days that the counts of a place by minutes are kept, before its newest ones.
+    pub place_minute_days: u32,
+    /// Days that its counts by hours are kept.
+    pub place_hour_days: u32,
     /// Connections with other systems; more are refused.
     pub outside_connections: u32,
     /// Bytes of one message of a connection; a larger one is skipped.
@@ -374,6 +392,7 @@ impl Default for Config {
             training: Workers::default(),
             evaluation: Workers::default(),
             export_folder: None,
+            archive: None,
             serial_devices: Vec::new(),
             connections: Vec::new(),
             console: Console::default(),
@@ -430,6 +449,8 @@ impl Default for Limits {
             event_streams: 256,
             tracks_per_camera: 256,
             track_points: 240,
+            history_track_bytes: 256 << 10,
+            history_queue: 1_024,
             live_ahead_s: 5,
             live_streams: 2_048,
             live_streams_per_client: 64,
@@ -449,6 +470,11 @@ impl Default for Limits {
             truth_line_positions: 1_000,
             cameras: 10_000,
             sites: 1_000,
+            places: 20_000,
+            place_queue: 65_536,
+            place_events: 1_000_000,
+            place_minute_days: 7,
+            place_hour_days: 400,
             outside_connections: 256,
             connection_message_bytes: 1 << 20,
             connection_queue: 1_024,
@@ -487,6 +513,31 @@ impl Default for Limits {
 }
 
 impl Limits {
+    /// Checks the length of a batch, before its items are read.
+    ///
+    /// # Errors
+    /// `TooLarge` and, for none at all, `InvalidArgument`, naming the field `observations`.
+    pub fn check_batch(&self, observations: usize) -> Result<()> {
+        if observations == 0 {
+            return Err(Error::invalid("observations", "must be one or more"));
+        }
+        let most = self.batch_observations;
+        if observations > most {
+            return Err(Error::field(
+                ErrorKind::TooLarge,
+                "observations",
+                format!("are {observations}, at most {most} go into one request; send several"),
+            ));
+        }
+        Ok(())
+    }
+
+    /// The bounds of times that may enter tracks and drift detection.
+    #[must_use]
+    pub fn live_time_bounds(&self, now: Timestamp) -> TimeBounds {
+        TimeBounds::live_at(now, self.live_ahead_s)
+    }
+
     /// Time to send a request's headers.
     #[must_use]
     pub const fn header_time(&self) -> Duration {

@@ -29,7 +29,7 @@ impl AuditService for Audit {
             let camera = camera.map(camera_id).transpose()?;
             let size = pages::size(asked.page_size, &app.limits)?;
             let before = pages::cursor::<AuditNumber>(&asked.page_token)?;
-            let page = app.audit_log(camera.as_ref(), before, size).await?;
+            let page = app.audit_log().list(camera.as_ref(), before, size).await?;
             Ok(proto::ListAuditEntriesResponse {
                 next_page_token: pages::token(page.next.as_ref()),
                 entries: page.items.into_iter().map(Into::into).collect(),

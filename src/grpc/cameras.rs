@@ -1,6 +1,7 @@
 //! `CameraService`.
 
 use super::convert::{camera_id, of_field, position, recipe, required, site_id, timestamp};
+use super::history::history_settings;
 use super::mask::named_fields;
 use super::pages;
 use super::proto;
@@ -101,7 +102,7 @@ impl CameraService for Cameras {
         request: tonic::Request<proto::GetLearningRequest>,
     ) -> Reply<proto::GetLearningResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let learning = app.learning(&camera_id(&asked.camera_id)?).await?;
+            let learning = app.recordings().learning(&camera_id(&asked.camera_id)?).await?;
             Ok(proto::GetLearningResponse { learning: Some(learning.into()) })
         })
         .await
@@ -134,6 +135,7 @@ fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> 
             .snapshot
             .map(|it| SnapshotSource::new(&it.url, it.username, it.password))
             .transpose()?,
+        history: profile.history.map(history_settings).transpose()?,
         id: named.id,
     })
 }
@@ -207,6 +209,7 @@ fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
         ("learn_automatically", profile.learn_automatically.is_some()),
         ("site", profile.site.is_some()),
         ("snapshot", profile.snapshot.is_some()),
+        ("history", profile.history.is_some()),
     ];
     has.into_iter().filter_map(|(field, has)| has.then_some(field)).collect()
 }
@@ -214,7 +217,7 @@ fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
 impl proto::Camera {
     fn of(app: &App, camera: Camera) -> Self {
         Self {
-            moved: app.camera_moved(camera.id()).map(|moved| (*moved).clone().into()),
+            moved: app.cameras().moved(camera.id()).map(|moved| (*moved).clone().into()),
             model_fault: app.models().fault(camera.id()).map(|fault| fault.reason),
             id: camera.id().as_str().to_owned(),
             warnings: app.cameras().warnings(&camera),
@@ -255,6 +258,7 @@ impl From<NewCamera> for proto::CameraProfile {
                 username: source.username().map(str::to_owned),
                 password: None,
             }),
+            history: profile.history.map(Into::into),
         }
     }
 }

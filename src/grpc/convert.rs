@@ -4,9 +4,10 @@
 use jiff::Timestamp;
 
 use super::proto;
+use super::proto::track_scope::Scope;
 use crate::domain::{
     self, CameraId, Error, ErrorKind, LiveItem, Observation, ReceiverId, Refusal, Result, RunId, Score,
-    SiteId, StoredSample, TargetClass, TargetId, TimeRange, TrackerId,
+    SiteId, StoredSample, TargetClass, TargetId, TimeRange, TrackScope, TrackerId,
 };
 use crate::exchange::wire;
 use crate::exchange::{RowError, RowRules};
@@ -36,6 +37,25 @@ pub(super) fn site_id(id: &str) -> Result<SiteId> {
         let shown: String = id.chars().take(80).collect();
         Error::refused(ErrorKind::SiteNotFound, format!("`{shown}` is not the id of a site"))
     })
+}
+
+/// The camera or site whose tracks a request means; `None` if it names none.
+pub(super) fn track_scope(scope: Option<proto::TrackScope>) -> Result<Option<TrackScope>> {
+    let of = |scope| match scope {
+        Scope::SiteId(id) => site_id(&id).map(TrackScope::Site),
+        Scope::CameraId(id) => camera_id(&id).map(TrackScope::Camera),
+    };
+    scope.and_then(|scope| scope.scope).map(of).transpose()
+}
+
+impl From<&TrackScope> for proto::TrackScope {
+    fn from(scope: &TrackScope) -> Self {
+        let scope = match scope {
+            TrackScope::Site(id) => Scope::SiteId(id.to_string()),
+            TrackScope::Camera(id) => Scope::CameraId(id.to_string()),
+        };
+        Self { scope: Some(scope) }
+    }
 }
 
 /// The training run that a request names.

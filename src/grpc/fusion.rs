@@ -40,12 +40,12 @@ impl FusionService for Fusion {
     async fn fuse(&self, request: tonic::Request<proto::FuseRequest>) -> Reply<proto::FuseResponse> {
         answer(&self.app, request, |app, asked| async move {
             let camera = camera_id(&asked.camera_id)?;
-            app.check_batch(asked.observations.len())?;
+            app.limits.check_batch(asked.observations.len())?;
             let camera = app.active_camera(&camera).await?;
             let rules = camera.row_rules(app.clock.now());
             let convert = |message| observation(message, &rules);
             let observations = convert_all("observations", asked.observations, convert)?;
-            let fused = app.fuse_batch(camera, &observations).await?;
+            let fused = app.fusion().fuse(camera, &observations).await?;
             Ok(proto::FuseResponse { fusions: fused.into_iter().map(Into::into).collect() })
         })
         .await

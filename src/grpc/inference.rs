@@ -50,7 +50,7 @@ impl GrpcInferenceService for Inference {
     ) -> Reply<proto::ModelReadyResponse> {
         answer(&self.app, request, |app, asked| async move {
             let camera = model_name(&asked.name, "name")?;
-            let ready = match app.served_model(&camera, version(&asked.version)).await {
+            let ready = match app.inference().served_model(&camera, version(&asked.version)).await {
                 Ok(_) => true,
                 Err(error) if error.kind() == ErrorKind::NoModel => false,
                 Err(error) => return Err(error),
@@ -80,7 +80,7 @@ impl GrpcInferenceService for Inference {
     ) -> Reply<proto::ModelMetadataResponse> {
         answer(&self.app, request, |app, asked| async move {
             let camera = model_name(&asked.name, "name")?;
-            let (_, version) = app.served_model(&camera, version(&asked.version)).await?;
+            let (_, version) = app.inference().served_model(&camera, version(&asked.version)).await?;
             let tensor = |name: &str, columns: usize| TensorMetadata {
                 name: name.to_owned(),
                 datatype: FP64.to_owned(),
@@ -108,7 +108,8 @@ impl GrpcInferenceService for Inference {
                 return Err(Error::invalid("inputs", format!("must be one tensor, `{BOXES}`")));
             };
             let boxes = boxes(input, &asked.raw_input_contents)?;
-            let inferred = app.infer(&camera, version(&asked.model_version), &boxes, &outputs).await?;
+            let inferred =
+                app.inference().infer(&camera, version(&asked.model_version), &boxes, &outputs).await?;
             Ok(response(asked, inferred, boxes.len()))
         })
         .await

@@ -14,6 +14,7 @@ pub mod client;
 mod convert;
 mod evaluations;
 mod fusion;
+mod history;
 mod idempotency;
 mod inference;
 mod keys;
@@ -23,6 +24,7 @@ mod models;
 mod outbox;
 mod pages;
 mod pairings;
+mod places;
 mod samples;
 mod site_training;
 mod sites;
@@ -50,8 +52,10 @@ use proto::audit_service_server::AuditServiceServer;
 use proto::camera_service_server::CameraServiceServer;
 use proto::evaluation_service_server::EvaluationServiceServer;
 use proto::fusion_service_server::FusionServiceServer;
+use proto::history_service_server::HistoryServiceServer;
 use proto::key_service_server::KeyServiceServer;
 use proto::model_service_server::ModelServiceServer;
+use proto::place_service_server::PlaceServiceServer;
 use proto::sample_service_server::SampleServiceServer;
 use proto::site_service_server::SiteServiceServer;
 use proto::track_service_server::TrackServiceServer;
@@ -90,9 +94,12 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
     let keys = KeyServiceServer::new(keys::Keys::new(app)).max_decoding_message_size(most);
     let audit = AuditServiceServer::new(audit::Audit::new(app)).max_decoding_message_size(most);
     let sites = SiteServiceServer::new(sites::Sites::new(app, shutdown)).max_decoding_message_size(most);
+    let places = PlaceServiceServer::new(places::Places::new(app, shutdown)).max_decoding_message_size(most);
     let tracks = TrackServiceServer::new(tracks::Tracks::new(app, shutdown)).max_decoding_message_size(most);
     let evaluations =
         EvaluationServiceServer::new(evaluations::Evaluations::new(app)).max_decoding_message_size(most);
+    let histories =
+        HistoryServiceServer::new(history::Histories::new(app, shutdown)).max_decoding_message_size(most);
     let inference = GrpcInferenceServiceServer::new(inference::Inference::new(app, shutdown))
         .max_decoding_message_size(most);
     let reflection = || {
@@ -117,8 +124,10 @@ pub fn router(app: &App, shutdown: &Shutdown) -> Routes {
         .add_service(keys)
         .add_service(audit)
         .add_service(sites)
+        .add_service(places)
         .add_service(tracks)
         .add_service(evaluations)
+        .add_service(histories)
         .add_service(inference)
         .prepare()
 }
@@ -149,7 +158,7 @@ pub fn refusal<B: Default>(error: &Error, id: &RequestId) -> Response<B> {
 }
 
 /// The services whose health is reported; the empty name is the server as a whole.
-const HEALTHY: [&str; 12] = [
+const HEALTHY: [&str; 14] = [
     "",
     CameraServiceServer::<()>::NAME,
     SampleServiceServer::<()>::NAME,
@@ -159,8 +168,10 @@ const HEALTHY: [&str; 12] = [
     KeyServiceServer::<()>::NAME,
     AuditServiceServer::<()>::NAME,
     SiteServiceServer::<()>::NAME,
+    PlaceServiceServer::<()>::NAME,
     TrackServiceServer::<()>::NAME,
     EvaluationServiceServer::<()>::NAME,
+    HistoryServiceServer::<()>::NAME,
     GrpcInferenceServiceServer::<()>::NAME,
 ];
 
@@ -203,8 +214,10 @@ mod tests {
             "KeyService",
             "AuditService",
             "SiteService",
+            "PlaceService",
             "TrackService",
             "EvaluationService",
+            "HistoryService",
             "GRPCInferenceService",
         ];
         assert_eq!(names, own);

@@ -3,6 +3,7 @@
 use prost::Message as _;
 
 use super::convert::{instant, of_field, position, required, run_id, site_id, timestamp};
+use super::history::history_settings;
 use super::idempotency::idempotent;
 use super::mask::named_fields;
 use super::pages;
@@ -101,7 +102,7 @@ impl SiteService for Sites {
         request: tonic::Request<proto::ListWorldTracksRequest>,
     ) -> Reply<proto::ListWorldTracksResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let tracks = app.world_tracks(&site_id(&asked.site_id)?).await?;
+            let tracks = app.world_tracks().latest(&site_id(&asked.site_id)?).await?;
             Ok(proto::ListWorldTracksResponse {
                 tracks: tracks.points.iter().map(|point| point.as_ref().into()).collect(),
                 last_event_id: tracks.last_event.to_string(),
@@ -116,7 +117,7 @@ impl SiteService for Sites {
     ) -> Reply<proto::GetWorldTrackResponse> {
         answer(&self.app, request, |app, asked| async move {
             let site = site_id(&asked.site_id)?;
-            let history = app.world_track_history(&site, live_id::of_track(&asked.track_id)?).await?;
+            let history = app.world_tracks().history(&site, live_id::of_track(&asked.track_id)?).await?;
             let points = history.iter().map(|point| point.as_ref().into()).collect();
             Ok(proto::GetWorldTrackResponse { points })
         })
@@ -191,7 +192,7 @@ impl SiteService for Sites {
             let lease = app.quotas.event_streams.try_acquire(client, 1)?;
             let site = site_id(&asked.site_id)?;
             let after = live_id::to_resume_after(&asked.resume_after)?;
-            let source = app.site_events(&site, after).await?;
+            let source = app.world_tracks().events(&site, after).await?;
             Ok(events(source, site, lease, self.shutdown.clone(), id))
         })
         .await
@@ -208,6 +209,7 @@ fn new_site(id: SiteId, profile: proto::SiteProfile) -> Result<NewSite> {
             .unwrap_or(named.display_name),
         labels: profile.labels.into_iter().collect(),
         origin: origin.transpose()?,
+        history: profile.history.map(history_settings).transpose()?,
         id: named.id,
     })
 }
@@ -222,6 +224,7 @@ fn site_change(
         ("display_name", !profile.display_name.is_empty()),
         ("labels", !profile.labels.is_empty()),
         ("origin", profile.origin.is_some()),
+        ("history", profile.history.is_some()),
     ];
     let present = has.into_iter().filter_map(|(field, has)| has.then_some(field)).collect();
     let is_named = named_fields(mask, &SiteChange::FIELDS, present)?;
@@ -241,6 +244,7 @@ impl From<Site> for proto::Site {
                 display_name: site.profile.display_name,
                 labels: site.profile.labels.into_iter().collect(),
                 origin: site.profile.origin.map(Into::into),
+                history: site.profile.history.map(Into::into),
             }),
         }
     }

@@ -13,7 +13,7 @@ use super::proto::stream_answer::Outcome;
 use super::proto::stream_request::Kind;
 use super::statuses::{broken, to_status};
 use crate::app::{Acknowledgement, App, ItemResult, LiveStream, NotStored, NotStoredReason, TrackPoint};
-use crate::domain::{CameraMoved, Error, ErrorKind, Flag, Result};
+use crate::domain::{CameraMoved, Error, ErrorKind, Flag, ReceiverMatch, Result};
 use crate::fusion::track::{MeasurementSource, Rejection, RejectionReason};
 use crate::request::RequestContext;
 use crate::shutdown::Shutdown;
@@ -123,15 +123,15 @@ impl StreamSession {
         let camera = camera_id(&opening.camera_id)?;
         let durability = durability(opening.durability)?;
         let store_samples = opening.store_samples.then_some(durability);
-        self.app
-            .open_stream(
-                &camera,
-                &opening.client_name,
-                self.context.client(),
-                opening.resume_after_seq,
-                store_samples,
-            )
-            .await
+        LiveStream::open(
+            &self.app,
+            &camera,
+            &opening.client_name,
+            self.context.client(),
+            opening.resume_after_seq,
+            store_samples,
+        )
+        .await
     }
 
     /// Reads and answers items. Whatever may end the stream is looked at before each batch, so a client
@@ -295,10 +295,7 @@ fn answer_of(seq: u64, item: ItemResult) -> proto::StreamAnswer {
         flags,
         lost_answers: 0,
         world_track_id: item.world_track.map(|id| id.to_string()),
-        receiver_match: item.receiver_match.map(|own| proto::ReceiverMatch {
-            receiver_id: own.receiver_id.as_str().to_owned(),
-            probability: own.probability,
-        }),
+        receiver_match: item.receiver_match.as_ref().map(Into::into),
     }
 }
 
@@ -353,7 +350,14 @@ impl From<&TrackPoint> for proto::TrackPoint {
             rejections: state.rejected.iter().map(Into::into).collect(),
             restarted: state.restarted,
             sources_disagree: state.sources_disagree,
+            receiver_match: point.receiver_match.as_ref().map(Into::into),
         }
+    }
+}
+
+impl From<&ReceiverMatch> for proto::ReceiverMatch {
+    fn from(own: &ReceiverMatch) -> Self {
+        Self { receiver_id: own.receiver_id.as_str().to_owned(), probability: own.probability }
     }
 }
 

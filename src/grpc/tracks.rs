@@ -34,7 +34,7 @@ impl TrackService for Tracks {
         request: tonic::Request<proto::ListTracksRequest>,
     ) -> Reply<proto::ListTracksResponse> {
         answer(&self.app, request, |app, asked| async move {
-            let tracks = app.tracks(&camera_id(&asked.camera_id)?).await?;
+            let tracks = app.live().tracks(&camera_id(&asked.camera_id)?).await?;
             let tracks = tracks.iter().map(|point| point.as_ref().into()).collect();
             Ok(proto::ListTracksResponse { tracks })
         })
@@ -49,7 +49,7 @@ impl TrackService for Tracks {
             let camera = camera_id(&asked.camera_id)?;
             let target = TargetId::new(&asked.target_id)
                 .map_err(|_| Error::refused(ErrorKind::TrackNotFound, "that is not the id of a target"))?;
-            let history = app.track_history(&camera, &target).await?;
+            let history = app.live().track_history(&camera, &target).await?;
             let points = history.iter().map(|point| point.as_ref().into()).collect();
             Ok(proto::GetTrackResponse { points })
         })
@@ -68,7 +68,7 @@ impl TrackService for Tracks {
             let after = Some(asked.resume_after.as_str())
                 .filter(|text| !text.is_empty())
                 .map(|text| text.parse().unwrap_or(EventId::UNKNOWN));
-            let source = app.camera_events(&camera, after).await?;
+            let source = app.live().camera_events(&camera, after).await?;
             Ok(events(source, camera, lease, self.shutdown.clone(), id))
         })
         .await

@@ -134,6 +134,7 @@ impl From<&WorldTrackPoint> for proto::WorldTrackPoint {
             motion: Some(point.motion.into()),
             covariance: Some(point.covariance_m2.into()),
             r95_m: point.r95_m(),
+            receiver_match: point.receiver_match.as_ref().map(Into::into),
             sightings: point
                 .sightings
                 .iter()

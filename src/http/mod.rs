@@ -7,6 +7,7 @@
 // Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
+mod description_page;
 mod plumbing;
 mod resources;
 #[cfg(test)]
@@ -16,19 +17,12 @@ use std::panic::AssertUnwindSafe;
 
 use axum::Router;
 use axum::body::Body;
-use axum::middleware::map_response;
 use axum::response::Response;
 use futures_util::FutureExt as _;
-use http_body_util::BodyExt as _;
-use hyper::header::{
-    CONTENT_LENGTH, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, X_FRAME_OPTIONS,
-};
-use hyper::http::HeaderValue;
 use hyper::{Method, Request};
 use tower::Service as _;
 use utoipa::openapi::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
-use utoipa_swagger_ui::{Config, SwaggerUi};
 
 use crate::admission::RequestClass;
 use crate::app::App;
@@ -55,11 +49,7 @@ impl Transport {
         let rest = Rest::new(app, console, shutdown);
         let (routes, described) = described().split_for_parts();
         let authorize = access::AuthorizeLayer::of(&described);
-        // The page would otherwise ask a server on the internet whether the description is well formed.
-        let page = SwaggerUi::new("/docs")
-            .url("/openapi.json", described)
-            .config(Config::default().validator_url("none").use_base_layout());
-        let page = Router::from(page).layer(map_response(contain_page));
+        let page = description_page::routes(described);
         Self(routes.route_layer(authorize).merge(page).merge(pages).with_state(rest))
     }
 
@@ -83,44 +73,6 @@ impl Transport {
         coding.encode(refused.explain(answer)).await
     }
 }
-
-/// The content security policy of the description's page: it runs its own scripts and asks its own server only.
-/// Swagger UI sets styles by attribute and shows images that it holds itself.
-const DESCRIPTION_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; \
-     img-src 'self' data:; font-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; \
-     frame-ancestors 'none'";
-
-/// Names the page, and contains what it may do.
-async fn contain_page(response: Response) -> Response {
-    let mut response = named(response).await;
-    for (name, value) in [
-        (CONTENT_SECURITY_POLICY, DESCRIPTION_POLICY),
-        (X_FRAME_OPTIONS, "DENY"),
-        (REFERRER_POLICY, "no-referrer"),
-    ] {
-        response.headers_mut().insert(name, HeaderValue::from_static(value));
-    }
-    response
-}
-
-/// The page under its own title instead of the library's.
-async fn named(response: Response) -> Response {
-    let is_page =
-        response.headers().get(CONTENT_TYPE).is_some_and(|it| it.as_bytes().starts_with(b"text/html"));
-    if !is_page {
-        return response;
-    }
-    let (mut head, body) = response.into_parts();
-    // The library holds the page in memory.
-    let Ok(page) = body.collect().await else { return problem::panicked(Box::new("the page has no body")) };
-    let page = String::from_utf8_lossy(&page.to_bytes()).replacen(LIBRARY_TITLE, TITLE, 1);
-    head.headers.remove(CONTENT_LENGTH);
-    Response::from_parts(head, Body::from(page))
-}
-
-/// The title of the page, as the library writes it.
-const LIBRARY_TITLE: &str = "<title>Swagger UI</title>";
-const TITLE: &str = "<title>sightfix: REST interface</title>";
 
 /// The class of a request, by its method and path.
 #[must_use]

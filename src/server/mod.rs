@@ -30,9 +30,11 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use tokio::net::TcpListener;
+use tokio::runtime::Handle;
 
 use crate::app::access::Caller;
 use crate::app::{App, NodeSettings, Retention, store_limits, store_location};
+use crate::archive::{Archive, Location as ArchiveLocation};
 use crate::clock::{Clock, Randomness};
 use crate::config::{Config, NodeRole, OtherNode};
 use crate::connect;
@@ -111,6 +113,9 @@ impl Server {
         if let Some(folder) = &config.export_folder {
             app.export_folder.get_or_init(|| folder.clone());
         }
+        if config.role.answers_clients() {
+            open_archive(&app, &config)?;
+        }
         app.serial_devices.get_or_init(|| config.serial_devices.clone());
         let tls = Tls::load(&config.tls)?;
         if tls.as_ref().is_some_and(|tls| tls.takes_client_certificates()) {
@@ -129,9 +134,9 @@ impl Server {
         });
         let monitoring = monitoring.transpose()?;
         if config.role.answers_clients() {
-            app.refresh_registries().await?;
+            app.nodes().refresh_registries().await?;
         }
-        app.join(NodeSettings::of(&config, reachable_url(&listener, tls.is_some())?)).await?;
+        app.nodes().join(NodeSettings::of(&config, reachable_url(&listener, tls.is_some())?)).await?;
         Ok(Self { config, app, listener, monitoring, tls, proxies, shutdown: Shutdown::new() })
     }
 
@@ -188,7 +193,7 @@ impl Server {
         }
         shutdown.spawn(maintenance_loop(reloader, config.role, shutdown.clone()));
         shutdown.spawn(retention_loop(app.clone(), shutdown.clone()));
-        shutdown.spawn(app.clone().keep_registered(shutdown.clone()));
+        shutdown.spawn(keep_registered(app.clone(), shutdown.clone()));
         if config.role.answers_clients() {
             shutdown.spawn(worker::learn(app.clone(), shutdown.clone()));
             shutdown.spawn(connect::Supervisor::start(app.clone()).await.run(shutdown.clone()));
@@ -238,12 +243,30 @@ fn reachable_url(listener: &TcpListener, has_tls: bool) -> std::io::Result<Optio
     Ok((!address.ip().is_unspecified()).then(|| format!("{scheme}://{address}")))
 }
 
+/// Opens the archive of finished tracks. Without the one that nobody asked for, the server starts all the same.
+fn open_archive(app: &App, config: &Config) -> anyhow::Result<()> {
+    let location = match &config.archive {
+        Some(archive) => ArchiveLocation::new(archive),
+        None => ArchiveLocation::Folder(config.data.join("archive")),
+    };
+    let (clock, randomness) = (app.clock.clone(), app.randomness.clone());
+    let new_name = move || randomness.uuid_v7(clock.now()).to_string();
+    match Archive::open(&location, Handle::current(), new_name) {
+        Ok(archive) => app.archived_history.use_archive(archive),
+        Err(error) if config.archive.is_none() => {
+            tracing::warn!(%error, "no finished tracks are kept: name a folder in the setting archive");
+        }
+        Err(error) => return Err(anyhow::Error::new(error).context("cannot open the archive")),
+    }
+    Ok(())
+}
+
 /// Stores the connections of the settings. Those that are not declared any more stay.
 async fn declare_connections(app: &App, config: &Config) -> anyhow::Result<()> {
     for (index, declared) in config.connections.iter().enumerate() {
         let declare = async {
             let draft: ConnectionDraft = parse_document(&declared.json().map_err(Error::fault)?)?;
-            app.declare_connection(draft.try_into()?).await
+            app.connections().declare(draft.try_into()?).await
         };
         declare.await.with_context(|| format!("the setting connections[{index}]"))?;
     }
@@ -294,7 +317,7 @@ async fn maintenance_loop(reloader: Reloader, role: NodeRole, shutdown: Shutdown
         gather_figures(app).await;
         // A worker reads what it trains when it trains it.
         if role.answers_clients()
-            && let Err(error) = app.refresh_registries().await
+            && let Err(error) = app.nodes().refresh_registries().await
         {
             tracing::error!(%error, "cannot look for changed sites and cameras");
         }
@@ -303,7 +326,7 @@ async fn maintenance_loop(reloader: Reloader, role: NodeRole, shutdown: Shutdown
         }
         round = (round + 1) % STORE_USES_EVERY;
         if round % FIGURES_EVERY == 1 {
-            match app.connection_figures().await {
+            match app.connections().figures().await {
                 Ok(figures) => app.metrics.outside_connections(&figures),
                 Err(error) => tracing::error!(%error, "the outboxes cannot be counted"),
             }
@@ -313,10 +336,14 @@ async fn maintenance_loop(reloader: Reloader, role: NodeRole, shutdown: Shutdown
         {
             tracing::error!(%error, "cannot store when keys were used last");
         }
-        if let Err(error) = app.retrain_moved().await {
+        if let Err(error) = app.retraining().start_due().await {
             tracing::error!(%error, "cannot retrain moved cameras");
         }
     }
+}
+
+async fn keep_registered(app: App, shutdown: Shutdown) {
+    app.nodes().keep_registered(shutdown).await;
 }
 
 /// Time between deletions of old samples, and before another attempt where one failed.
@@ -328,7 +355,7 @@ async fn retention_loop(app: App, shutdown: Shutdown) {
     let app = app.on_behalf_of(Caller::program("retention"));
     let work = async {
         loop {
-            let pause = match app.retain_samples().await {
+            let pause = match app.samples().retain().await {
                 Ok(Retention::Deleted(0)) => RETENTION_EVERY,
                 Ok(Retention::Deleted(deleted)) => {
                     tracing::info!(deleted, "samples older than limits.sample_days were deleted");

@@ -34,17 +34,17 @@ pub async fn learn(app: App, shutdown: Shutdown) {
             () = shutdown.draining() => {}
             () = tokio::time::sleep(STORE_EVERY) => {}
         }
-        if let Err(error) = app.store_recordings().await {
+        if let Err(error) = app.recordings().store_pending().await {
             tracing::error!(%error, "boxes and fixes to learn from cannot be stored");
         }
         round = (round + 1) % RETAIN_EVERY;
         if round == 0
-            && let Err(error) = app.retain_recordings().await
+            && let Err(error) = app.recordings().retain().await
         {
             tracing::error!(%error, "old recordings cannot be deleted");
         }
         let Ok(place) = slot.clone().try_acquire_owned() else { continue };
-        if let Some(camera) = app.begin_learning() {
+        if let Some(camera) = app.recordings().begin_learning() {
             let (app, ending) = (app.clone(), shutdown.clone());
             shutdown.spawn(async move {
                 attempt(&app, &camera, &ending).await;
@@ -64,11 +64,11 @@ async fn attempt(app: &App, camera: &ActiveCamera, shutdown: &Shutdown) {
         }
     };
     tracing::info!(camera.id = %camera.id, outcome, "a recording was matched");
-    app.end_learning(camera, outcome);
+    app.recordings().end_learning(camera, outcome);
 }
 
 async fn learn_from(app: &App, camera: &ActiveCamera, shutdown: &Shutdown) -> Result<String> {
-    let recording = app.recorded(camera).await?;
+    let recording = app.recordings().recorded(camera).await?;
     let settings = MatchSettings { limits: MatchLimits::from(&app.limits), ..MatchSettings::default() };
     let image_size = camera.image_size;
     let work = move |sink: &ProgressSink<()>| {
@@ -84,7 +84,7 @@ async fn learn_from(app: &App, camera: &ActiveCamera, shutdown: &Shutdown) -> Re
     }
     let (matched, ()) = thread.join().await;
     let (samples, outcome) = matched.ok_or_else(|| Error::fault("the thread of the matching panicked"))??;
-    let run = app.train_on_matched(&camera.id, samples).await?;
+    let run = app.recordings().train_on_matched(&camera.id, samples).await?;
     Ok(format!("{outcome}; training run {}", run.id))
 }
 

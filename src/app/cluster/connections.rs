@@ -9,15 +9,15 @@ use std::sync::atomic::Ordering;
 
 use tokio_util::sync::CancellationToken;
 
+use super::Nodes;
 use super::camera_lease::between_nodes;
 use super::connection_lease::{ConnectionLease, HeldConnection};
 use super::membership::Membership;
-use crate::app::App;
 use crate::app::live::sync::lock;
 use crate::domain::{CameraId, ConnectionId, ConnectionKey, Error, NodeId, Result};
 use crate::store::ConnectionReports;
 
-impl App {
+impl Nodes<'_> {
     /// The connections of these groups that this node runs: those it owns, and those of groups without an owner up to
     /// its share. What it owned besides is given up as soon as nothing here uses it.
     ///
@@ -27,7 +27,7 @@ impl App {
         &self,
         groups: &[Vec<ConnectionKey>],
     ) -> Result<HashMap<ConnectionKey, ConnectionLease>> {
-        let Some(membership) = self.cluster.membership() else {
+        let Some(membership) = self.membership() else {
             return Ok(groups.iter().flatten().map(|key| (*key, ConnectionLease::of_every_node())).collect());
         };
         let registration = membership.registration.load_full();
@@ -61,8 +61,8 @@ impl App {
     /// # Errors
     /// `CameraNotFound`; the database does not answer.
     pub async fn want_camera(&self, id: &CameraId) -> Result<()> {
-        let Some(membership) = self.cluster.membership() else { return Ok(()) };
-        let camera = self.active_camera(id).await?;
+        let Some(membership) = self.membership() else { return Ok(()) };
+        let camera = self.cameras.get(id).await?;
         membership.leases.want(camera.key, membership.registration.load().id).await
     }
 
@@ -75,7 +75,7 @@ impl App {
         node: NodeId,
         statuses: &[(ConnectionKey, String)],
     ) -> Result<()> {
-        match self.cluster.membership() {
+        match self.membership() {
             Some(membership) => membership.leases.store_connection_statuses(node, statuses).await,
             None => Ok(()),
         }
@@ -83,7 +83,7 @@ impl App {
 
     /// The id under which this node reports to others; `None` if there are none.
     pub(in crate::app) fn reporting_node(&self) -> Option<NodeId> {
-        self.cluster.membership().map(|membership| membership.registration.load().id)
+        self.membership().map(|membership| membership.registration.load().id)
     }
 
     /// The nodes' reports of a connection; `None` for a server that shares its database with no other.
@@ -94,7 +94,7 @@ impl App {
         &self,
         key: ConnectionKey,
     ) -> Result<Option<ConnectionReports>> {
-        match self.cluster.membership() {
+        match self.membership() {
             Some(membership) => Ok(Some(membership.leases.connection_reports(key).await?)),
             None => Ok(None),
         }
@@ -109,7 +109,7 @@ impl App {
         id: &ConnectionId,
         key: ConnectionKey,
     ) -> Result<Option<Error>> {
-        let Some(membership) = self.cluster.membership() else { return Ok(None) };
+        let Some(membership) = self.membership() else { return Ok(None) };
         let source = format!("the source {id}");
         let owner = membership.leases.connection_reports(key).await?.owner;
         Ok(Some(match owner {

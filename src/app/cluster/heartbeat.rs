@@ -5,11 +5,11 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use super::Nodes;
 use super::history::DatabaseHistory;
 use super::membership::Membership;
 use super::registration::Registration;
 use super::watches::Watched;
-use crate::app::App;
 use crate::config::NodeRole;
 use crate::domain::{Error, ErrorKind, NodeId, Result};
 use crate::shutdown::Shutdown;
@@ -23,14 +23,14 @@ const UNUSED_TIME: Duration = Duration::from_secs(60);
 const DRAIN_PAUSE: Duration = Duration::from_millis(50);
 const LEAST_PAUSE: Duration = Duration::from_millis(10);
 
-impl App {
+impl Nodes<'_> {
     /// Keeps this node registered and its ownerships up to date until the server shuts down, then hands over what it
     /// owns as soon as nobody uses it here. A server that shares its database with no other has nothing to do.
     pub async fn keep_registered(self, shutdown: Shutdown) {
-        let Some(membership) = self.cluster.membership() else { return };
+        let Some(membership) = self.membership() else { return };
         tokio::select! {
             // Renewals never wait for what else is to be done.
-            ((), ()) = async { tokio::join!(renew_on(&self, membership), tend_on(&self, membership)) } => {}
+            ((), ()) = async { tokio::join!(renew_on(self, membership), tend_on(self, membership)) } => {}
             () = hand_over(membership, &shutdown) => {}
         }
         let registration = membership.registration.load_full();
@@ -41,11 +41,11 @@ impl App {
     }
 }
 
-async fn renew_on(app: &App, membership: &Membership) {
+async fn renew_on(nodes: Nodes<'_>, membership: &Membership) {
     let interval = membership.profile.lease / RENEWALS;
     loop {
-        let renewed = tokio::time::timeout(membership.profile.lease / 2, renew(app, membership)).await;
-        let now = app.clock.monotonic();
+        let renewed = tokio::time::timeout(membership.profile.lease / 2, renew(nodes, membership)).await;
+        let now = nodes.clock.monotonic();
         let pause = match renewed.unwrap_or_else(|_| Err(no_answer())) {
             Ok(()) => membership.next_silence().map_or(interval, |at| at.saturating_sub(now).min(interval)),
             Err(error) => {
@@ -61,32 +61,32 @@ async fn renew_on(app: &App, membership: &Membership) {
 }
 
 /// One renewal; a node that was not heard of for too long registers again and owns nothing.
-async fn renew(app: &App, membership: &Membership) -> Result<()> {
-    let sent_at = app.clock.monotonic();
+async fn renew(nodes: Nodes<'_>, membership: &Membership) -> Result<()> {
+    let sent_at = nodes.clock.monotonic();
     let registration = membership.registration.load_full();
     if !registration.is_valid(sent_at) {
-        membership.lose(app);
-        return register_again(app, membership, &registration).await;
+        membership.lose(nodes);
+        return register_again(nodes, membership, &registration).await;
     }
     let is_draining = membership.is_draining.load(Ordering::Acquire);
-    let renewed = membership.leases.renew(registration.id, random(app), is_draining).await?;
-    let Some(Renewed { nodes, keys, mark }) = renewed else {
-        membership.lose(app);
-        return register_again(app, membership, &registration).await;
+    let renewed = membership.leases.renew(registration.id, random(nodes), is_draining).await?;
+    let Some(Renewed { nodes: registered, keys, mark }) = renewed else {
+        membership.lose(nodes);
+        return register_again(nodes, membership, &registration).await;
     };
-    if membership.history.observe(app, mark) {
+    if membership.history.observe(nodes, mark) {
         // Acquisitions may be among what was lost, and others have made them again.
-        membership.lose(app);
+        membership.lose(nodes);
         membership.is_outdated.notify_one();
-        return register_again(app, membership, &registration).await;
+        return register_again(nodes, membership, &registration).await;
     }
     registration.extend(membership.valid_until(sent_at));
-    if !app.access.confirm(&keys, sent_at) {
+    if !nodes.access.confirm(&keys, sent_at) {
         membership.has_other_keys.store(true, Ordering::Release);
         membership.is_outdated.notify_one();
     }
-    app.metrics.nodes(nodes.len());
-    let silent = membership.observe(nodes, registration.id, app.clock.monotonic());
+    nodes.metrics.nodes(registered.len());
+    let silent = membership.observe(registered, registration.id, nodes.clock.monotonic());
     for (id, renewal) in silent {
         if membership.leases.end_unrenewed(id, renewal).await? {
             tracing::warn!(node = %id, "a node has ended without releasing its cameras: they are free");
@@ -95,12 +95,12 @@ async fn renew(app: &App, membership: &Membership) -> Result<()> {
     Ok(())
 }
 
-async fn register_again(app: &App, membership: &Membership, before: &Registration) -> Result<()> {
+async fn register_again(nodes: Nodes<'_>, membership: &Membership, before: &Registration) -> Result<()> {
     membership.leases.end(before.id).await?;
-    let sent_at = app.clock.monotonic();
-    let id = NodeId(app.randomness.uuid_v7(app.clock.now()));
-    let mark = membership.leases.register(id, &membership.profile, random(app)).await?;
-    if membership.history.observe(app, mark) {
+    let sent_at = nodes.clock.monotonic();
+    let id = NodeId(nodes.randomness.uuid_v7(nodes.clock.now()));
+    let mark = membership.leases.register(id, &membership.profile, random(nodes)).await?;
+    if membership.history.observe(nodes, mark) {
         membership.is_outdated.notify_one();
     }
     membership.registration.store(Arc::new(Registration::new(id, membership.valid_until(sent_at))));
@@ -109,22 +109,22 @@ async fn register_again(app: &App, membership: &Membership, before: &Registratio
 }
 
 /// Reads what has changed, gives up what is not used any more, and ends readers whose camera or site another node owns.
-async fn tend_on(app: &App, membership: &Membership) {
+async fn tend_on(nodes: Nodes<'_>, membership: &Membership) {
     loop {
         tokio::select! {
             () = tokio::time::sleep(membership.profile.lease / RENEWALS) => {}
             () = membership.is_outdated.notified() => {}
         }
-        let now = app.clock.monotonic();
+        let now = nodes.clock.monotonic();
         membership.give_up(|lease, is_used| {
-            let camera = app.registry.get(&lease.camera).filter(|camera| camera.key == lease.key);
+            let camera = nodes.registry.get(&lease.camera).filter(|camera| camera.key == lease.key);
             // A camera that goes to another site goes to the node of that site.
             let has_left = camera.is_none_or(|camera| camera.site != lease.site);
             has_left || (!is_used && lease.unused_for(now) >= UNUSED_TIME)
         });
-        app.metrics.owned_cameras(membership.owned());
+        nodes.metrics.owned_cameras(membership.owned());
         let tended = async {
-            catch_up(app, membership).await?;
+            catch_up(nodes, membership).await?;
             give_up_wanted(membership).await?;
             membership.release().await?;
             end_watches(membership).await
@@ -136,16 +136,16 @@ async fn tend_on(app: &App, membership: &Membership) {
 }
 
 /// Reads what a renewal found to be outdated.
-async fn catch_up(app: &App, membership: &Membership) -> Result<()> {
+async fn catch_up(nodes: Nodes<'_>, membership: &Membership) -> Result<()> {
     let (breaks, is_broken) =
         (membership.history.breaks(), membership.history.state() == DatabaseHistory::Reading);
     if membership.has_other_keys.swap(false, Ordering::AcqRel) || is_broken {
-        app.access.refresh(&app.store, &app.clock).await?;
+        nodes.access.refresh(nodes.store, nodes.clock).await?;
     }
     if is_broken {
         // A process that only works on jobs reads a camera when it needs it.
         if membership.profile.role != NodeRole::Train.as_str() {
-            app.refresh_registries().await?;
+            nodes.refresh_registries().await?;
         }
         membership.history.has_read_after(breaks);
         tracing::info!("everything was read again from the database");
@@ -198,8 +198,8 @@ fn no_answer() -> Error {
     Error::refused(ErrorKind::Overloaded, "the database did not answer in time")
 }
 
-pub(super) fn random(app: &App) -> i64 {
+pub(super) fn random(nodes: Nodes<'_>) -> i64 {
     let mut number = [0; 8];
-    app.randomness.fill(&mut number);
+    nodes.randomness.fill(&mut number);
     i64::from_le_bytes(number)
 }

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use jiff::Timestamp;
 
-use crate::app::App;
+use super::Nodes;
 use crate::app::live::sync::lock;
 use crate::store::HistoryMark;
 
@@ -37,7 +37,7 @@ impl HistoryWatch {
     }
 
     /// Notes where a renewal was stored; whether what was acknowledged before may be lost.
-    pub(super) fn observe(&self, app: &App, mark: HistoryMark) -> bool {
+    pub(super) fn observe(&self, nodes: Nodes<'_>, mark: HistoryMark) -> bool {
         let before = std::mem::replace(&mut *lock(&self.mark), mark.clone());
         let Some(reason) = mark.break_since(&before) else { return false };
         tracing::error!(
@@ -45,12 +45,12 @@ impl HistoryWatch {
             "the history of the database has changed: without synchronous replication what it acknowledged last is lost; \
              everything is read again"
         );
-        app.metrics.database_history_broke();
-        *lock(&self.broke_at) = Some(app.clock.now());
+        nodes.metrics.database_history_broke();
+        *lock(&self.broke_at) = Some(nodes.clock.now());
         self.breaks.fetch_add(1, Ordering::AcqRel);
-        app.access.distrust();
-        app.site_registry.distrust();
-        app.registry.distrust();
+        nodes.access.distrust();
+        nodes.site_registry.distrust();
+        nodes.registry.distrust();
         true
     }
 

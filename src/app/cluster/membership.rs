@@ -8,12 +8,12 @@ use std::time::Duration;
 use arc_swap::ArcSwap;
 use tokio::sync::Notify;
 
+use super::Nodes;
 use super::camera_lease::{CameraLease, HeldLease, between_nodes, camera_text};
 use super::connection_lease::HeldConnection;
 use super::history::HistoryWatch;
 use super::registration::Registration;
 use super::watches::{Watched, Watches};
-use crate::app::App;
 use crate::app::live::sync::lock;
 use crate::app::registry::ActiveCamera;
 use crate::config::NodeRole;
@@ -96,13 +96,13 @@ impl Membership {
     ///
     /// # Errors
     /// `CameraOnOtherNode`, `CameraBetweenNodes`, `CameraNotFound`; `Overloaded` where the database does not answer.
-    pub(super) async fn own(&self, app: &App, camera: &ActiveCamera) -> Result<CameraLease> {
-        if let Some(lease) = self.held(camera.key, app.clock.monotonic()) {
+    pub(super) async fn own(&self, nodes: Nodes<'_>, camera: &ActiveCamera) -> Result<CameraLease> {
+        if let Some(lease) = self.held(camera.key, nodes.clock.monotonic()) {
             return Ok(lease);
         }
         let _acquiring =
             self.acquiring[camera.key.0.cast_unsigned() as usize % ACQUISITION_LOCKS].lock().await;
-        let now = app.clock.monotonic();
+        let now = nodes.clock.monotonic();
         if let Some(lease) = self.held(camera.key, now) {
             return Ok(lease);
         }
@@ -113,15 +113,15 @@ impl Membership {
         match self.leases.acquire(camera.key, registration.id).await? {
             Acquired::Owned { fence, is_takeover } => {
                 if is_takeover {
-                    app.metrics.camera_taken_over();
+                    nodes.metrics.camera_taken_over();
                 }
-                if app.registry.begin_tenure(&camera.id, camera.key, fence).await {
-                    self.clear_site(app, camera).await?;
+                if nodes.registry.begin_tenure(&camera.id, camera.key, fence).await {
+                    self.clear_site(nodes, camera).await?;
                 }
                 Ok(self.hold(HeldLease::new(camera, fence, registration, now)))
             }
             Acquired::OtherNode(other) => {
-                Err(self.elsewhere(&camera_text(&camera.id), other, app.clock.monotonic()))
+                Err(self.elsewhere(&camera_text(&camera.id), other, nodes.clock.monotonic()))
             }
             Acquired::NotRegistered => Err(between_nodes(&camera_text(&camera.id))),
         }
@@ -132,23 +132,23 @@ impl Membership {
     ///
     /// # Errors
     /// The database does not answer.
-    pub(super) async fn clear_former(&self, app: &App, read: Watched) -> Result<()> {
+    pub(super) async fn clear_former(&self, nodes: Nodes<'_>, read: Watched) -> Result<()> {
         let fences = match read {
             Watched::Camera(key) => self.leases.latest_fences(Some(key), None).await?,
             Watched::Site(key) => self.leases.latest_fences(None, Some(key)).await?,
         };
         for (key, fence) in fences {
-            if let Some(camera) = app.registry.clear_before(key, fence).await {
-                self.clear_site(app, &camera).await?;
+            if let Some(camera) = nodes.registry.clear_before(key, fence).await {
+                self.clear_site(nodes, &camera).await?;
             }
         }
         Ok(())
     }
 
     /// Clears the live state of the site of a camera whose own was cleared.
-    async fn clear_site(&self, app: &App, camera: &ActiveCamera) -> Result<()> {
+    async fn clear_site(&self, nodes: Nodes<'_>, camera: &ActiveCamera) -> Result<()> {
         match camera.site.as_ref().filter(|site| !self.holds_camera_of(site)) {
-            Some(site) => app.site_registry.reset(&app.store, site).await,
+            Some(site) => nodes.site_registry.reset(nodes.store, site).await,
             None => Ok(()),
         }
     }
@@ -215,7 +215,7 @@ impl Membership {
     }
 
     /// Ends everything that this node owned, and what reads it: another one may own it from now on.
-    pub(super) fn lose(&self, app: &App) {
+    pub(super) fn lose(&self, nodes: Nodes<'_>) {
         if !self.registration.load().invalidate() {
             return;
         }
@@ -228,7 +228,7 @@ impl Membership {
             cameras = lost.len(),
             "this node has lost its registration: its live streams end here"
         );
-        app.metrics.node_registration_lost();
+        nodes.metrics.node_registration_lost();
     }
 
     /// Takes the nodes as they were just read; those of which nothing was heard for their lease.

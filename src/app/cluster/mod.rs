@@ -26,9 +26,15 @@ use self::membership::Membership;
 use self::registration::Registration;
 use self::watches::Watched;
 use super::App;
-use super::registry::ActiveCamera;
+use super::access::Access;
+use super::active_cameras::ActiveCameras;
+use super::registry::{ActiveCamera, Registry};
+use super::site_registry::SiteRegistry;
+use crate::clock::{Clock, Randomness};
 use crate::config::{Config, NodeRole};
 use crate::domain::{CameraId, Error, Node, NodeId, NodeProfile, Result, SiteId, SiteKey};
+use crate::store::Store;
+use crate::telemetry::Metrics;
 
 pub use camera_lease::CameraLease;
 pub use connection_lease::ConnectionLease;
@@ -94,8 +100,40 @@ impl Cluster {
     }
 }
 
+/// The nodes of a database, and what of it this one owns.
+#[derive(Clone, Copy)]
+pub struct Nodes<'a> {
+    cluster: &'a Cluster,
+    cameras: ActiveCameras<'a>,
+    store: &'a Store,
+    registry: &'a Registry,
+    site_registry: &'a SiteRegistry,
+    access: &'a Access,
+    clock: &'a Clock,
+    randomness: &'a Randomness,
+    metrics: &'a Metrics,
+}
+
 impl App {
-    /// Registers this process where others share its database. [`App::keep_registered`] must run from then on.
+    /// The nodes of a database, and what of it this one owns.
+    #[must_use]
+    pub fn nodes(&self) -> Nodes<'_> {
+        Nodes {
+            cluster: &self.cluster,
+            cameras: self.active_cameras(),
+            store: &self.store,
+            registry: &self.registry,
+            site_registry: &self.site_registry,
+            access: &self.access,
+            clock: &self.clock,
+            randomness: &self.randomness,
+            metrics: &self.metrics,
+        }
+    }
+}
+
+impl<'a> Nodes<'a> {
+    /// Registers this process where others share its database. [`Nodes::keep_registered`] must run from then on.
     ///
     /// # Errors
     /// The database does not answer.
@@ -116,10 +154,10 @@ impl App {
             }
             Some(leases) => {
                 let sent_at = self.clock.monotonic();
-                let mark = leases.register(id, &profile, heartbeat::random(self)).await?;
+                let mark = leases.register(id, &profile, heartbeat::random(*self)).await?;
                 // Everything read from here on is of that history, or of a later one that a renewal notices.
                 self.access.set_lease(lease);
-                self.access.refresh(&self.store, &self.clock).await?;
+                self.access.refresh(self.store, self.clock).await?;
                 let registration = Registration::new(id, sent_at);
                 let membership = Membership::new(leases.clone(), profile, registration, mark);
                 membership.registration.load().extend(membership.valid_until(sent_at));
@@ -129,18 +167,27 @@ impl App {
         self.cluster.0.set(joined).map_err(|_| Error::fault("the process has joined already"))
     }
 
+    /// Brings sites and cameras up to date, including changes of other processes.
+    ///
+    /// # Errors
+    /// A fault if the store cannot be read.
+    pub async fn refresh_registries(&self) -> Result<()> {
+        self.site_registry.refresh(self.store).await?;
+        self.registry.refresh(self.store).await
+    }
+
     /// A camera with the right to change its live state, which this node acquires if no other has it.
     ///
     /// # Errors
     /// As [`App::active_camera`]; `CameraOnOtherNode`, `CameraBetweenNodes`.
     pub async fn own_camera(&self, id: &CameraId) -> Result<(Arc<ActiveCamera>, CameraLease)> {
-        let camera = self.active_camera(id).await?;
-        let Some(membership) = self.cluster.membership() else {
+        let camera = self.cameras.get(id).await?;
+        let Some(membership) = self.membership() else {
             return Ok((camera, CameraLease::of_only_node()));
         };
-        let lease = membership.own(self, &camera).await?;
+        let lease = membership.own(*self, &camera).await?;
         // A new owner begins with new live state.
-        Ok((self.active_camera(id).await?, lease))
+        Ok((self.cameras.get(id).await?, lease))
     }
 
     /// Checks that the live state of a camera may be read here: this node owns it, or no other does. What is older than
@@ -149,29 +196,33 @@ impl App {
     /// # Errors
     /// `CameraOnOtherNode`, `CameraBetweenNodes`.
     pub(super) async fn check_readable(&self, camera: &ActiveCamera) -> Result<()> {
-        let Some(membership) = self.cluster.membership() else { return Ok(()) };
+        let Some(membership) = self.membership() else { return Ok(()) };
         if membership.held(camera.key, self.clock.monotonic()).is_some() {
             return Ok(());
         }
         let owner = membership.leases.camera_owner(camera.key).await?;
         self.check_owner(membership, &camera_text(&camera.id), owner)?;
-        membership.clear_former(self, Watched::Camera(camera.key)).await
+        membership.clear_former(*self, Watched::Camera(camera.key)).await
     }
 
     /// True if this node surely owns a camera.
     pub(super) fn owns_camera(&self, camera: &ActiveCamera) -> bool {
-        self.cluster.membership().is_none_or(|it| it.holds(camera.key, self.clock.monotonic()))
+        self.membership().is_none_or(|it| it.holds(camera.key, self.clock.monotonic()))
     }
 
     /// Checks that the live state of a site may be read here.
     ///
     /// # Errors
-    /// As [`App::check_readable`].
+    /// As [`Nodes::check_readable`].
     pub(super) async fn check_site_readable(&self, id: &SiteId, site: SiteKey) -> Result<()> {
-        let Some(membership) = self.cluster.membership() else { return Ok(()) };
+        let Some(membership) = self.membership() else { return Ok(()) };
         let owner = membership.leases.site_owner(site).await?;
         self.check_owner(membership, &format!("site {id}"), owner)?;
-        membership.clear_former(self, Watched::Site(site)).await
+        membership.clear_former(*self, Watched::Site(site)).await
+    }
+
+    fn membership(&self) -> Option<&'a Membership> {
+        self.cluster.membership()
     }
 
     fn check_owner(&self, membership: &Membership, owned: &str, owner: Option<NodeId>) -> Result<()> {
@@ -185,20 +236,20 @@ impl App {
 
     /// Until when a reader of a camera's live state is right here.
     pub(super) fn watch_camera_owner(&self, camera: &ActiveCamera) -> Watch {
-        let membership = self.cluster.membership();
+        let membership = self.membership();
         membership.map_or_else(Watch::default, |it| it.watches.begin(Watched::Camera(camera.key)))
     }
 
     /// Until when a reader of a site's live state is right here.
     pub(super) fn watch_site_owner(&self, site: SiteKey) -> Watch {
-        let membership = self.cluster.membership();
+        let membership = self.membership();
         membership.map_or_else(Watch::default, |it| it.watches.begin(Watched::Site(site)))
     }
 
     /// Compares the history of what this process knows with that of the database.
     #[must_use]
     pub fn database_history(&self) -> DatabaseHistory {
-        let membership = self.cluster.membership();
+        let membership = self.membership();
         membership.map_or(DatabaseHistory::Unbroken, |it| it.history.state())
     }
 
@@ -206,7 +257,7 @@ impl App {
     ///
     /// # Errors
     /// The database does not answer.
-    pub async fn nodes(&self) -> Result<Vec<NodeStatus>> {
+    pub async fn list(&self) -> Result<Vec<NodeStatus>> {
         match self.cluster.0.get() {
             None => Ok(Vec::new()),
             Some(Joined::Alone(id, profile)) => {

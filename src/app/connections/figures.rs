@@ -1,17 +1,17 @@
 //! Figures of connections for the metrics.
 
-use crate::app::App;
+use super::Connections;
 use crate::domain::Result;
 use crate::telemetry::OutsideFigures;
 
-impl App {
+impl Connections<'_> {
     /// The figures of the connections of this node.
     ///
     /// # Errors
     /// A fault of the store.
-    pub async fn connection_figures(&self) -> Result<Vec<OutsideFigures>> {
+    pub async fn figures(&self) -> Result<Vec<OutsideFigures>> {
         let mut figures = Vec::new();
-        for (id, key, status) in self.connection_board.all() {
+        for (id, key, status) in self.board.all() {
             let outbox = self.store.outbox_counts(key).await?;
             let waits_since = outbox.oldest_at.map(|oldest_at| self.clock.now().duration_since(oldest_at));
             figures.push(OutsideFigures {

@@ -9,22 +9,28 @@ mod reports;
 mod status;
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::path::PathBuf;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use bytes::Bytes;
 use tokio::sync::{mpsc, oneshot};
 
+use super::access::Caller;
+use super::active_cameras::ActiveCameras;
+use super::cluster::Nodes;
 use super::{App, Page, page_of};
+use crate::clock::Clock;
 use crate::domain::{
     Connection, ConnectionId, ConnectionKey, DeadLetter, Error, ErrorKind, ExpectedVersion, NewConnection,
     OutboxCounts, Result, check_text,
 };
-use crate::exchange::{
-    Address, ConnectionDraft, ConnectionSettings, Scheme, Secrets, SerialLine, SourceSettings,
-};
+use crate::exchange::kinds::{SerialLine, SourceKind};
+use crate::exchange::{ConnectionDraft, ConnectionSettings, Secrets, SourceSettings};
+use crate::store::Store;
 
 pub use groups::connection_groups;
+pub use outbox::Outboxes;
 pub use reports::{ConnectionNode, ReportedStatuses};
 pub use status::{
     ConnectionBoard, ConnectionState, ConnectionStatus, CountedReason, LastMessage, LiveConnection,
@@ -92,18 +98,46 @@ pub fn connection_settings(connection: &Connection) -> Result<(ConnectionSetting
     Ok((settings, serde_json::from_str(&connection.profile.secrets).map_err(Error::fault)?))
 }
 
+/// Connections with other systems.
+#[derive(Clone, Copy)]
+pub struct Connections<'a> {
+    cameras: ActiveCameras<'a>,
+    store: &'a Store,
+    board: &'a ConnectionBoard,
+    nodes: Nodes<'a>,
+    serial_devices: &'a OnceLock<Vec<PathBuf>>,
+    clock: &'a Clock,
+    caller: &'a Caller,
+}
+
 impl App {
+    /// Connections with other systems.
+    #[must_use]
+    pub fn connections(&self) -> Connections<'_> {
+        Connections {
+            cameras: self.active_cameras(),
+            store: &self.store,
+            board: &self.connection_board,
+            nodes: self.nodes(),
+            serial_devices: &self.serial_devices,
+            clock: &self.clock,
+            caller: &self.caller,
+        }
+    }
+}
+
+impl Connections<'_> {
     /// Stores a new connection, which starts at once unless it is paused.
     ///
     /// # Errors
     /// `ConnectionExists`; `InvalidArgument` naming the field; `InsufficientStorage` beyond the limit.
-    pub async fn create_connection(&self, request: ConnectionRequest) -> Result<Connection> {
+    pub async fn create(&self, request: ConnectionRequest) -> Result<Connection> {
         self.check_device(&request)?;
         let settings = request.settings.clone();
         let profile = request.into_profile(Secrets::default())?;
         self.check_cameras(&settings).await?;
         let connection = self.store.insert_connection(&profile, self.clock.now()).await?;
-        self.connection_board.notify();
+        self.board.notify();
         Ok(connection)
     }
 
@@ -111,7 +145,7 @@ impl App {
     ///
     /// # Errors
     /// `InvalidArgument` naming the field; `InsufficientStorage` beyond the limit.
-    pub async fn declare_connection(&self, request: ConnectionRequest) -> Result<()> {
+    pub async fn declare(&self, request: ConnectionRequest) -> Result<()> {
         self.check_device(&request)?;
         let profile = request.into_profile(Secrets::default())?;
         let now = self.clock.now();
@@ -130,7 +164,7 @@ impl App {
     /// Checks that the cameras exist that settings name.
     async fn check_cameras(&self, settings: &ConnectionSettings) -> Result<()> {
         for (field, camera) in settings.named_cameras()? {
-            match self.active_camera(&camera).await {
+            match self.cameras.get(&camera).await {
                 Err(error) if error.kind() == ErrorKind::CameraNotFound => {
                     let message = format!("there is no camera {camera}; create it first");
                     return Err(Error::invalid(field, message));
@@ -145,21 +179,20 @@ impl App {
     fn check_device(&self, request: &ConnectionRequest) -> Result<()> {
         let source = request.settings.source.as_ref().filter(|_| !request.paused);
         let Some(source) = source else { return Ok(()) };
-        let checked = source.address().and_then(|address| match address.scheme {
-            Scheme::Serial => self.serial_line(&address).map(drop),
+        let checked = source.kind().and_then(|kind| match kind {
+            SourceKind::Serial(line) => self.check_serial_line(&line),
             _ => Ok(()),
         });
         checked.map_err(|error| error.under("source"))
     }
 
-    /// The serial device of an address, if the operator of the machine lets it be read.
+    /// Checks that the operator of the machine lets a serial device be read.
     ///
     /// # Errors
     /// `InvalidArgument` naming `address`.
-    pub fn serial_line(&self, address: &Address) -> Result<SerialLine> {
-        let line = address.serial_line()?;
+    pub fn check_serial_line(&self, line: &SerialLine) -> Result<()> {
         if self.serial_devices.get().is_some_and(|devices| devices.contains(&line.path)) {
-            return Ok(line);
+            return Ok(());
         }
         let path = line.path.display();
         let message = format!("{path} may not be read; name it in the setting serial_devices of the server");
@@ -170,7 +203,7 @@ impl App {
     ///
     /// # Errors
     /// `ConnectionNotFound`.
-    pub async fn connection(&self, id: &ConnectionId) -> Result<Connection> {
+    pub async fn get(&self, id: &ConnectionId) -> Result<Connection> {
         self.store.connection(id).await
     }
 
@@ -178,7 +211,7 @@ impl App {
     ///
     /// # Errors
     /// A fault of the store.
-    pub async fn connections(
+    pub async fn list(
         &self,
         after: Option<&ConnectionId>,
         limit: u32,
@@ -192,7 +225,7 @@ impl App {
     ///
     /// # Errors
     /// `ConnectionNotFound`, `RevisionMismatch`, `InvalidArgument` naming the field.
-    pub async fn change_connection(
+    pub async fn change(
         &self,
         request: ConnectionRequest,
         expected: ExpectedVersion<ConnectionKey>,
@@ -208,7 +241,7 @@ impl App {
             self.check_cameras(&wanted).await?;
         }
         let connection = self.store.replace_connection(&profile, Some(expected), self.clock.now()).await?;
-        self.connection_board.notify();
+        self.board.notify();
         Ok(connection)
     }
 
@@ -216,14 +249,14 @@ impl App {
     ///
     /// # Errors
     /// `ConnectionNotFound`, `RevisionMismatch`.
-    pub async fn delete_connection(
+    pub async fn delete(
         &self,
         id: &ConnectionId,
         expected: Option<ExpectedVersion<ConnectionKey>>,
     ) -> Result<()> {
         self.store.delete_connection(id, expected, self.clock.now()).await?;
-        self.connection_board.forget(id);
-        self.connection_board.notify();
+        self.board.forget(id);
+        self.board.notify();
         Ok(())
     }
 
@@ -231,7 +264,7 @@ impl App {
     ///
     /// # Errors
     /// A fault of the store.
-    pub async fn connection_status(
+    pub async fn status(
         &self,
         connection: &Connection,
     ) -> Result<(ConnectionStatus, Option<ConnectionNode>, OutboxCounts)> {
@@ -245,8 +278,8 @@ impl App {
 
     /// The live part of a connection.
     #[must_use]
-    pub fn live_connection(&self, connection: &Connection) -> Arc<LiveConnection> {
-        self.connection_board.live(connection.id(), connection.key)
+    pub fn live(&self, connection: &Connection) -> Arc<LiveConnection> {
+        self.board.live(connection.id(), connection.key)
     }
 
     /// Dead letters of a connection, oldest first, after the number of one.
@@ -290,14 +323,14 @@ impl App {
     /// `ConnectionNotFound`; `ConnectionNotReceiving` if it is paused or has another kind of address; `Overloaded`
     /// while its queue is full; `MalformedBody` for a message that cannot be read; `CameraOnOtherNode`,
     /// `CameraBetweenNodes` where another node runs the source.
-    pub async fn push_message(&self, id: &ConnectionId, payload: Bytes) -> Result<Option<&'static str>> {
+    pub async fn push(&self, id: &ConnectionId, payload: Bytes) -> Result<Option<&'static str>> {
         let connection = self.store.connection(id).await?;
         let (settings, _) = connection_settings(&connection)?;
         let source = settings.source.ok_or_else(|| not_receiving(id))?;
         self.authorize_source(&source)?;
         let inlet = self.inlet(&connection).await?;
         let (settled, settlement) = oneshot::channel();
-        let sender = self.caller().actor().name.to_string();
+        let sender = self.caller.actor().name.to_string();
         let message = PushedMessage { sender, payload: payload.clone(), settled };
         inlet.try_send(message).map_err(|_| {
             Error::refused(ErrorKind::Overloaded, format!("connection {id} has too many messages to do"))
@@ -314,7 +347,7 @@ impl App {
 
     /// The way to the running source of a connection, which may only just begin.
     async fn inlet(&self, connection: &Connection) -> Result<mpsc::Sender<PushedMessage>> {
-        let live = self.live_connection(connection);
+        let live = self.live(connection);
         if let Some(inlet) = live.inlet() {
             return Ok(inlet);
         }
@@ -325,17 +358,16 @@ impl App {
     /// Checks that a connection is a source that takes messages by HTTP, on this node.
     async fn check_receiving(&self, connection: &Connection) -> Result<()> {
         let (settings, _) = connection_settings(connection)?;
-        let address = settings.source.as_ref().map(|source| source.address()).transpose()?;
-        if connection.profile.paused || address.is_none_or(|address| address.scheme != Scheme::Push) {
+        let kind = settings.source.as_ref().map(|source| source.kind()).transpose()?;
+        if connection.profile.paused || !matches!(kind, Some(SourceKind::Push)) {
             return Err(not_receiving(connection.id()));
         }
-        self.source_elsewhere(connection.id(), connection.key).await?.map_or(Ok(()), Err)
+        self.nodes.source_elsewhere(connection.id(), connection.key).await?.map_or(Ok(()), Err)
     }
 
     /// Checks that the caller may reach every camera that a source feeds.
     fn authorize_source(&self, source: &SourceSettings) -> Result<()> {
-        let is_restricted =
-            self.caller().principal().scope().is_some_and(|scope| !scope.cameras().is_empty());
+        let is_restricted = self.caller.principal().scope().is_some_and(|scope| !scope.cameras().is_empty());
         if !is_restricted {
             return Ok(());
         }
@@ -345,7 +377,7 @@ impl App {
         }
         let mapped = source.cameras.values().map(|mapping| mapping.camera());
         for camera in mapped.chain(source.fix_cameras()?.into_iter().map(Ok)) {
-            self.caller().authorize_camera(&camera?)?;
+            self.caller.authorize_camera(&camera?)?;
         }
         Ok(())
     }

@@ -2,8 +2,8 @@
 
 use std::collections::HashMap;
 
+use super::Connections;
 use super::status::{ConnectionState, ConnectionStatus};
-use crate::app::App;
 use crate::domain::{Connection, ConnectionKey, Error, NodeId, Result};
 use crate::store::ConnectionReports;
 
@@ -22,17 +22,17 @@ pub struct ReportedStatuses {
     statuses: HashMap<ConnectionKey, ConnectionStatus>,
 }
 
-impl App {
+impl Connections<'_> {
     /// Tells other nodes what has changed of the connections that run here, if there are other nodes.
     ///
     /// # Errors
     /// The database does not answer.
-    pub async fn report_connections(&self, reported: &mut ReportedStatuses) -> Result<()> {
-        let Some(node) = self.reporting_node() else { return Ok(()) };
+    pub async fn report(&self, reported: &mut ReportedStatuses) -> Result<()> {
+        let Some(node) = self.nodes.reporting_node() else { return Ok(()) };
         if reported.node.replace(node) != Some(node) {
             reported.statuses.clear();
         }
-        let mut statuses = self.connection_board.statuses();
+        let mut statuses = self.board.statuses();
         // A status that equals the reported one needs no report.
         statuses.retain(|key, status| *reported.statuses.entry(*key).or_default() != *status);
         if statuses.is_empty() {
@@ -41,7 +41,7 @@ impl App {
         let texts = statuses.iter().map(|(key, status)| {
             serde_json::to_string(status).map(|text| (*key, text)).map_err(Error::fault)
         });
-        self.store_connection_statuses(node, &texts.collect::<Result<Vec<_>>>()?).await?;
+        self.nodes.store_connection_statuses(node, &texts.collect::<Result<Vec<_>>>()?).await?;
         reported.statuses.extend(statuses);
         Ok(())
     }
@@ -54,9 +54,9 @@ impl App {
         &self,
         connection: &Connection,
     ) -> Result<(ConnectionStatus, Option<ConnectionNode>)> {
-        let own = self.live_connection(connection).status();
+        let own = self.live(connection).status();
         let (Some(reports), Some(node)) =
-            (self.connection_reports(connection.key).await?, self.reporting_node())
+            (self.nodes.connection_reports(connection.key).await?, self.nodes.reporting_node())
         else {
             return Ok((own, None));
         };

@@ -9,11 +9,14 @@ use std::sync::{Arc, Weak};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
-use crate::app::registry::ActiveCamera;
+use crate::app::registry::{ActiveCamera, Registry};
 use crate::app::{App, Parts};
-use crate::domain::{CameraMoved, Error, ErrorKind, Observation, Result};
+use crate::clock::Clock;
+use crate::domain::{CameraMoved, Error, ErrorKind, Observation, Result, TimeBounds};
 use crate::fusion::drift_detector::ResidualSample;
 use crate::fusion::observed::ObservedPositions;
+use crate::store::Store;
+use crate::telemetry::Metrics;
 
 /// Residuals that wait for their detector.
 const QUEUE: usize = 4_096;
@@ -36,6 +39,38 @@ impl ResidualQueue {
     /// Ends the task once it has worked off what waits now.
     pub(in crate::app) fn close(&self) {
         self.closed.cancel();
+    }
+
+    /// Hands a residual to the camera's drift detector.
+    pub(super) fn hand_over(&self, camera: &Arc<ActiveCamera>, residual: ResidualSample) {
+        if self.sender.try_send(PairResidual { camera: camera.clone(), residual }).is_err() {
+            tracing::debug!(camera.id = %camera.id, "a residual was dropped, the queue of the drift detectors is full");
+        }
+    }
+
+    /// Hands over the residual of the last of some observations with box, fix and target: for clients who
+    /// only ask for positions. One of a batch is enough.
+    pub(in crate::app) fn hand_over_last(
+        &self,
+        camera: &Arc<ActiveCamera>,
+        observations: &[(&Observation, ObservedPositions<'_>)],
+        bounds: TimeBounds,
+    ) {
+        let residual = observations.iter().rev().find_map(|(observation, observed)| {
+            let (regressed, fix) = (observed.usable_box()?.independent, observed.fix?);
+            bounds.check(observation.time()).ok()?;
+            Some(ResidualSample {
+                time: observation.time(),
+                target_id: observation.target_id().cloned()?,
+                regressed: regressed.regressed,
+                fix: fix.in_plane?,
+                e_regression_m2: regressed.variance_m2(),
+                e_gnss_m2: fix.variance_m2,
+            })
+        });
+        if let Some(residual) = residual {
+            self.hand_over(camera, residual);
+        }
     }
 }
 
@@ -67,7 +102,7 @@ impl WaitingResiduals {
             let Some(parts) = app.upgrade().filter(|_| !batch.is_empty()) else { return };
             let app = App::of_program(parts, "drift detection");
             for PairResidual { camera, residual } in batch.drain(..) {
-                app.detect_drift(&camera, &residual).await;
+                app.drift_alarms().detect(&camera, &residual).await;
             }
             // Answers go first, and what they bring meanwhile is taken at once: waking this task for each costs more.
             tokio::task::yield_now().await;
@@ -75,40 +110,27 @@ impl WaitingResiduals {
     }
 }
 
+/// Alarms that a camera was moved.
+struct DriftAlarms<'a> {
+    store: &'a Store,
+    registry: &'a Registry,
+    clock: &'a Clock,
+    metrics: &'a Metrics,
+}
+
 impl App {
-    /// Hands a residual to the camera's drift detector.
-    pub(super) fn hand_over(&self, camera: &Arc<ActiveCamera>, residual: ResidualSample) {
-        if self.residuals.sender.try_send(PairResidual { camera: camera.clone(), residual }).is_err() {
-            tracing::debug!(camera.id = %camera.id, "a residual was dropped, the queue of the drift detectors is full");
+    fn drift_alarms(&self) -> DriftAlarms<'_> {
+        DriftAlarms {
+            store: &self.store,
+            registry: &self.registry,
+            clock: &self.clock,
+            metrics: &self.metrics,
         }
     }
+}
 
-    /// Hands over the residual of the last of some observations with box, fix and target: for clients who
-    /// only ask for positions. One of a batch is enough.
-    pub(in crate::app) fn hand_over_last(
-        &self,
-        camera: &Arc<ActiveCamera>,
-        observations: &[(&Observation, ObservedPositions<'_>)],
-    ) {
-        let bounds = self.live_time_bounds(self.clock.now());
-        let residual = observations.iter().rev().find_map(|(observation, observed)| {
-            let (regressed, fix) = (observed.usable_box()?.independent, observed.fix?);
-            bounds.check(observation.time()).ok()?;
-            Some(ResidualSample {
-                time: observation.time(),
-                target_id: observation.target_id().cloned()?,
-                regressed: regressed.regressed,
-                fix: fix.in_plane?,
-                e_regression_m2: regressed.variance_m2(),
-                e_gnss_m2: fix.variance_m2,
-            })
-        });
-        if let Some(residual) = residual {
-            self.hand_over(camera, residual);
-        }
-    }
-
-    async fn detect_drift(&self, camera: &ActiveCamera, residual: &ResidualSample) {
+impl DriftAlarms<'_> {
+    async fn detect(&self, camera: &ActiveCamera, residual: &ResidualSample) {
         let Some(model) = camera.model() else { return };
         let Some(moved) = camera.live.drift.observe(model, residual) else { return };
         // An alarm that cannot be stored is raised again with the next residual.
@@ -132,7 +154,7 @@ impl App {
             stored => stored?,
         };
         camera.live.drift.saved();
-        self.registry.refresh_camera(&self.store, id).await?;
+        self.registry.refresh_camera(self.store, id).await?;
         if is_new {
             tracing::warn!(
                 camera.id = %id, model = moved.model_version, onset_at = %moved.onset_at,

@@ -15,6 +15,7 @@ use super::matching::LiveMatching;
 use super::sample_recorder::SampleRecorder;
 use super::sync::lock;
 use super::tracks::{TrackPoint, Tracks};
+use crate::app::history::path::FinishedTrack;
 use crate::domain::{BoundingBox, CameraMoved, FusedFix, Score, TargetClass, TargetId, TrackerId};
 
 /// When something was observed, by the server's clock.
@@ -99,6 +100,16 @@ impl CameraLive {
             replaced: CancellationToken::new(),
             tenure: AtomicI64::new(0),
         })
+    }
+
+    /// Ends the recordings of targets that have not been observed for too long.
+    pub(in crate::app) fn finish_silent_tracks(&self, now: Duration) {
+        self.tracks.remove_silent(now);
+    }
+
+    /// Ends all recordings.
+    pub(in crate::app) fn finish_all_tracks(&self) -> Vec<FinishedTrack> {
+        self.tracks.finish_all()
     }
 
     /// Ends the streams and listeners of a camera that was deleted.

@@ -9,7 +9,7 @@ use jiff::{SignedDuration, Timestamp};
 
 use super::sync::lock;
 use crate::app::recording::Recording;
-use crate::domain::{Detection, Observation, ReceivedFix, ReceiverId, TargetClass, TargetId};
+use crate::domain::{Detection, Observation, ReceivedFix, ReceiverId, TargetId};
 
 /// Least time between two recorded boxes of a tracker's id: matching needs no more of a walker.
 const BOX_INTERVAL: SignedDuration = SignedDuration::from_millis(450);
@@ -118,12 +118,12 @@ struct State {
 
 impl LiveLearning {
     /// Records a box that has only a tracker's id, or a fix of a receiver.
-    pub(super) fn observe(&self, observation: &Observation, class: Option<&TargetClass>) {
+    pub(super) fn observe(&self, observation: &Observation) {
         let time = observation.time();
         match (observation.tracker_id(), observation.bounding_box(), observation.fix()) {
             (Some(tracker_id), Some(bounding_box), _) => {
                 let target_id = TargetId::from(tracker_id);
-                let class = class.cloned();
+                let class = observation.class().cloned();
                 lock(&self.0).record_box(Detection { time, target_id, bounding_box, class, score: None });
             }
             (None, None, Some(fix)) => {
@@ -246,14 +246,14 @@ mod tests {
         let bounding_box = BoundingBox::new(1.0, 2.0, 3.0, 4.0).expect("a box");
         let observation = Observation::new(at(second), None, Some(bounding_box), None).expect("a box");
         let tracker_id = TrackerId::new("7").expect("an id");
-        learning.observe(&observation.with_tracker_id(Some(tracker_id)).expect("no target"), None);
+        learning.observe(&observation.with_tracker_id(Some(tracker_id)).expect("no target"));
     }
 
     fn fixed(learning: &LiveLearning, second: f64) {
         let fix = Fix { position: Position::new(8.0, 47.0).expect("a place"), sigma_m: None };
         let phone = TargetId::new("phone").expect("an id");
         let observation = Observation::new(at(second), Some(phone), None, Some(fix)).expect("a fix");
-        learning.observe(&observation, None);
+        learning.observe(&observation);
     }
 
     #[test]

@@ -20,11 +20,11 @@ use crate::fusion::association::{
 use crate::model::Regressor;
 
 /// Least time between the starts of two rounds of matching.
-const MIN_PERIOD: Duration = Duration::from_secs(1);
+pub(super) const MIN_PERIOD: Duration = Duration::from_secs(1);
 /// Matching of one camera takes at most this share of a core; all cameras together take one core.
-const MAX_LOAD: f64 = 0.1;
+pub(super) const MAX_LOAD: f64 = 0.1;
 /// Seed of the sampler: the same window gives the same matches.
-const SEED: u64 = 1;
+pub(super) const SEED: u64 = 1;
 
 /// The matching of one camera.
 pub(super) struct LiveMatching {
@@ -76,6 +76,12 @@ impl LiveMatching {
             }
             _ => None,
         }
+    }
+
+    /// True if the carrier of a receiver is in view, by the latest round.
+    pub(super) fn shows(&self, receiver_id: &ReceiverId) -> bool {
+        let state = lock(&self.state);
+        state.matches.trackers_of(receiver_id).any(|tracker_id| state.window.is_in_view(tracker_id))
     }
 
     /// True if a round is to begin now, by the monotonic clock; [`Self::end_round`] ends it.

@@ -25,8 +25,10 @@ pub(super) mod sync;
 mod tracks;
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use jiff::Timestamp;
+use tokio_util::task::TaskTracker;
 
 use self::camera::CameraLive;
 use self::camera_events::CameraEventReader;
@@ -34,15 +36,23 @@ use self::identification::Identified;
 use self::sync::lock;
 use self::tracks::TargetObservation;
 use super::App;
-use super::cluster::{CameraLease, Watch};
+use super::active_cameras::ActiveCameras;
+use super::cluster::{CameraLease, Nodes, Watch};
 use super::fusion::fuse_for_camera;
+use super::history::queue::ArchivedHistory;
+use super::history::recorder::TrackRecorder;
+use super::places::PlaceMonitor;
 use super::registry::ActiveCamera;
+use super::site_registry::SiteRegistry;
+use crate::clock::Clock;
+use crate::config::Limits;
 use crate::domain::{
-    CameraId, CameraMoved, Error, ErrorKind, FusedFix, LiveId, Observation, ReceiverMatch, Result, TargetId,
-    TimeBounds,
+    CameraId, Error, ErrorKind, FusedFix, HistorySettings, LiveId, Observation, ReceiverMatch, Result,
+    TargetId, TrackScope,
 };
 use crate::exchange::RowRules;
 use crate::fusion::observed::ObservedPositions;
+use crate::telemetry::Metrics;
 
 pub use acknowledgements::{Acknowledgement, NotStored, NotStoredReason};
 pub(super) use alarms::{ResidualQueue, residual_queue};
@@ -51,10 +61,11 @@ pub use camera_events::{EventId, LostEvents};
 pub(super) use identification::MatchingSlot;
 pub(super) use learning::LearningProgress;
 pub(super) use retraining::RetrainSchedule;
-pub use sink_feeds::{SinkFeed, SinkFeeds, SinkPosition, WantedPositions};
+pub use retraining::Retraining;
+pub use sink_feeds::{SinkFeed, SinkFeeds, SinkPosition, WantedEvents, WantedPositions};
 pub use site::{
     LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
-    WorldSighting, WorldTrackPoint,
+    WorldSighting, WorldTrackPoint, WorldTracks,
 };
 pub(super) use stream::StreamSlots;
 pub use stream::{ChangeNotices, LiveStream};
@@ -86,6 +97,20 @@ pub struct CameraActivity {
     pub frozen_since: Option<Timestamp>,
 }
 
+impl CameraActivity {
+    /// That of a camera, with its targets only where the node owns it: a former owner does not know what the present
+    /// one sees.
+    pub(super) fn of(camera: &ActiveCamera, is_owned: bool, now: Duration) -> Self {
+        let observed = camera.live.latest_observed();
+        Self {
+            targets: if is_owned { camera.live.tracks.latest(now).len() } else { 0 },
+            streams: camera.live.open_streams(),
+            last_observed_at: observed.last_at,
+            frozen_since: observed.frozen_since,
+        }
+    }
+}
+
 /// The events of one camera from some instant on; they end when it is deleted, or another node has become its owner.
 pub struct CameraEvents {
     reader: CameraEventReader<CameraEvent>,
@@ -112,17 +137,50 @@ impl CameraEvents {
     }
 }
 
-impl App {
-    /// The bounds of times that may enter tracks and drift detection.
-    #[must_use]
-    pub fn live_time_bounds(&self, now: Timestamp) -> TimeBounds {
-        TimeBounds::live_at(now, self.limits.live_ahead_s)
-    }
+/// Targets as boxes and fixes come, and readers of where they are.
+#[derive(Clone, Copy)]
+pub struct Live<'a> {
+    cameras: ActiveCameras<'a>,
+    nodes: Nodes<'a>,
+    places: &'a Arc<PlaceMonitor>,
+    archived_history: &'a ArchivedHistory,
+    site_registry: &'a SiteRegistry,
+    sink_feeds: &'a SinkFeeds,
+    residuals: &'a ResidualQueue,
+    matching_slot: &'a MatchingSlot,
+    tasks: &'a TaskTracker,
+    clock: &'a Clock,
+    limits: &'a Limits,
+    metrics: &'a Metrics,
+}
 
+impl App {
+    /// Targets as boxes and fixes come, and readers of where they are.
+    #[must_use]
+    pub fn live(&self) -> Live<'_> {
+        Live {
+            cameras: self.active_cameras(),
+            nodes: self.nodes(),
+            places: &self.place_monitor,
+            archived_history: &self.archived_history,
+            site_registry: &self.site_registry,
+            sink_feeds: &self.sink_feeds,
+            residuals: &self.residuals,
+            matching_slot: &self.matching_slot,
+            tasks: &self.tasks,
+            clock: &self.clock,
+            limits: &self.limits,
+            metrics: &self.metrics,
+        }
+    }
+}
+
+impl Live<'_> {
     /// The rules for live observations of a camera.
     #[must_use]
-    pub fn live_rules(&self, camera: &ActiveCamera) -> RowRules {
-        RowRules { time_bounds: self.live_time_bounds(self.clock.now()), image_size: camera.image_size }
+    pub fn rules(&self, camera: &ActiveCamera) -> RowRules {
+        let time_bounds = self.limits.live_time_bounds(self.clock.now());
+        RowRules { time_bounds, image_size: camera.image_size }
     }
 
     /// Answers an observation, feeds its target's track and the tracker of the camera's site, and compares box
@@ -138,8 +196,8 @@ impl App {
     ) -> Result<ItemResult> {
         // A time that no track takes must not move the matching either.
         let now = self.clock.now();
-        self.live_time_bounds(now).check(observation.time())?;
-        let identified = self.identify(camera, observation, None);
+        self.limits.live_time_bounds(now).check(observation.time())?;
+        let identified = self.identify(camera, observation);
         self.follow_identified((camera, lease), identified, now)
     }
 
@@ -175,13 +233,25 @@ impl App {
         let world_track = self.feed_site(camera, observation, &observed);
         let (track, residual) = match (target, observation.target_id()) {
             (Some(mut target), Some(target_id)) => {
-                target.update(&TargetObservation { target_id, observed, model, now }, &self.limits)
+                let receiver_match = receiver_match.as_ref();
+                let seen = TargetObservation { target_id, receiver_match, observed, model, now };
+                let (point, residual) = target.update(&seen, self.limits);
+                if let Some(point) = &point {
+                    let recorder =
+                        camera.history.map(|settings| move || self.track_recorder(&camera.id, settings));
+                    target.record(point, observation.class(), recorder);
+                }
+                drop(target);
+                (point, residual.or_else(|| camera.live.tracks.compared_with_fixes(&seen)))
             }
             _ => (None, None),
         };
         if let Some(point) = &track {
             self.metrics.tracked(point.state.innovations.iter().map(|it| it.nis), &point.state.rejected);
             self.sink_feeds.push(&camera.id, observation, point);
+            if !self.is_fix_of_shown_carrier(camera, observation) {
+                self.places.measured_by_camera(&camera.id, observation, point);
+            }
             camera.live.announce_track(now, || TargetUpdate {
                 point: point.clone(),
                 bounding_box: observation.bounding_box(),
@@ -189,21 +259,17 @@ impl App {
             });
         }
         if let Some(residual) = residual {
-            self.hand_over(camera, residual);
+            self.residuals.hand_over(camera, residual);
         }
         Ok(ItemResult { fused, track, world_track, receiver_match })
     }
 
-    /// Returns the activity in a camera's view.
-    pub(super) fn activity(&self, camera: &ActiveCamera) -> CameraActivity {
-        let (observed, tracks) = (camera.live.latest_observed(), &camera.live.tracks);
-        CameraActivity {
-            // A former owner does not know what the present one sees.
-            targets: if self.owns_camera(camera) { tracks.latest(self.clock.monotonic()).len() } else { 0 },
-            streams: camera.live.open_streams(),
-            last_observed_at: observed.last_at,
-            frozen_since: observed.frozen_since,
-        }
+    fn track_recorder(&self, camera: &CameraId, settings: HistorySettings) -> TrackRecorder {
+        TrackRecorder::new(
+            self.archived_history.queue().clone(),
+            TrackScope::Camera(camera.clone()),
+            settings,
+        )
     }
 
     /// Where every target of a camera is now, by target; those that expired are left out.
@@ -218,7 +284,7 @@ impl App {
     /// Where every target of a camera was, by target, each oldest first; those that expired are left out.
     ///
     /// # Errors
-    /// As [`App::tracks`].
+    /// As [`Live::tracks`].
     pub async fn track_histories(&self, id: &CameraId) -> Result<Vec<Vec<Arc<TrackPoint>>>> {
         let camera = self.readable_camera(id).await?;
         let now = self.clock.monotonic();
@@ -229,7 +295,7 @@ impl App {
     /// Where a target was, oldest first, as far back as the history reaches.
     ///
     /// # Errors
-    /// As [`App::tracks`]; `TrackNotFound`.
+    /// As [`Live::tracks`]; `TrackNotFound`.
     pub async fn track_history(&self, id: &CameraId, target_id: &TargetId) -> Result<Vec<Arc<TrackPoint>>> {
         let camera = self.readable_camera(id).await?;
         let history = camera.live.tracks.history(target_id, self.clock.monotonic());
@@ -240,27 +306,21 @@ impl App {
     }
 
     /// A camera whose live state is read.
-    pub(super) async fn readable_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
-        let camera = self.active_camera(id).await?;
-        self.check_readable(&camera).await?;
+    pub(in crate::app) async fn readable_camera(&self, id: &CameraId) -> Result<Arc<ActiveCamera>> {
+        let camera = self.cameras.get(id).await?;
+        self.nodes.check_readable(&camera).await?;
         // Its live state may be a new one.
-        self.active_camera(id).await
+        self.cameras.get(id).await
     }
 
     /// Everything that happens in a camera's view from now on, or after the last event that the reader has
     /// seen. A reader that is too slow, or was away for too long, misses the oldest of what it has not read.
     ///
     /// # Errors
-    /// As [`App::tracks`].
+    /// As [`Live::tracks`].
     pub async fn camera_events(&self, id: &CameraId, last_seen: Option<EventId>) -> Result<CameraEvents> {
         let camera = self.readable_camera(id).await?;
-        let watch = self.watch_camera_owner(&camera);
+        let watch = self.nodes.watch_camera_owner(&camera);
         Ok(CameraEvents { reader: camera.live.events.reader(last_seen), live: camera.live.clone(), watch })
-    }
-
-    /// Returns the detected movement of a camera if its active model no longer fits what the camera sees.
-    #[must_use]
-    pub fn camera_moved(&self, id: &CameraId) -> Option<Arc<CameraMoved>> {
-        self.registry.get(id)?.moved.clone()
     }
 }

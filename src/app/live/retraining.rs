@@ -5,9 +5,12 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use super::sync::lock;
-use crate::app::registry::ActiveCamera;
-use crate::app::{App, RunRequest};
+use crate::app::registry::{ActiveCamera, Registry};
+use crate::app::{App, RunRequest, Training};
+use crate::clock::Clock;
+use crate::config::Limits;
 use crate::domain::{CameraKey, CameraMoved, Error, JobState, Result};
+use crate::store::Store;
 
 /// Pauses grow up to this many doublings.
 const MOST_DOUBLINGS: u32 = 6;
@@ -41,22 +44,48 @@ impl RetrainSchedule {
     }
 }
 
+/// Training runs of cameras that were moved.
+#[derive(Clone, Copy)]
+pub struct Retraining<'a> {
+    store: &'a Store,
+    registry: &'a Registry,
+    training: Training<'a>,
+    schedule: &'a RetrainSchedule,
+    clock: &'a Clock,
+    limits: &'a Limits,
+}
+
 impl App {
+    /// Training runs of cameras that were moved.
+    #[must_use]
+    pub fn retraining(&self) -> Retraining<'_> {
+        Retraining {
+            store: &self.store,
+            registry: &self.registry,
+            training: self.training(),
+            schedule: &self.retrain_schedule,
+            clock: &self.clock,
+            limits: &self.limits,
+        }
+    }
+}
+
+impl Retraining<'_> {
     /// Starts a training run for every camera that was moved and is to be trained again by itself, and
     /// another one when that run failed or its version was not promoted. To be called every few seconds:
     /// a camera costs nothing until its next attempt is due.
     ///
     /// # Errors
     /// A fault of the store.
-    pub async fn retrain_moved(&self) -> Result<()> {
+    pub async fn start_due(&self) -> Result<()> {
         let waiting = self.registry.select(|camera| camera.retrain_when_moved && camera.moved.is_some());
         let key = |camera: &Arc<ActiveCamera>| Some((camera.key, camera.moved.as_ref()?.model_version));
         let keys: Vec<_> = waiting.iter().filter_map(key).collect();
-        self.retraining.retain(&keys);
+        self.schedule.retain(&keys);
         let (now, pause) = (self.clock.monotonic(), Duration::from_secs(self.limits.retrain_pause_s.into()));
         for (camera, key) in waiting.iter().zip(keys) {
             if let Some(moved) = &camera.moved
-                && self.retraining.take_due(key, now, pause)
+                && self.schedule.take_due(key, now, pause)
             {
                 self.retrain(camera, moved).await?;
             }
@@ -75,7 +104,7 @@ impl App {
             None | Some(JobState::Failed | JobState::Succeeded) => {}
         }
         let request = RunRequest { from: Some(moved.onset_at), ..RunRequest::default() };
-        match self.training().start(id, request, None).await {
+        match self.training.start(id, request, None).await {
             Ok(run) => {
                 self.store.note_retraining(id, moved.model_version, run.id).await?;
                 tracing::info!(camera.id = %id, run.id = %run.id, "training again, because the camera was moved");

@@ -9,13 +9,16 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use arc_swap::ArcSwap;
+use jiff::Timestamp;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use super::sync::lock;
 use super::tracks::TrackPoint;
-use crate::domain::{CameraId, ConnectionKey, Observation, TargetId};
+use crate::domain::{CameraId, ConnectionKey, Observation, OutboxMessage, TargetId, TrackScope};
+use crate::exchange::kinds::Topic;
+use crate::places::event::PlaceEvent;
 
 /// Positions that wait for the outbox of a sink; beyond, the oldest are lost, and counted.
 const MOST_WAITING: usize = 10_000;
@@ -47,6 +50,15 @@ pub struct WantedPositions {
     pub cameras: Vec<CameraId>,
     /// The least time between two positions of a target, s.
     pub min_interval_s: f64,
+}
+
+/// The events of places that a sink requests.
+#[derive(Debug, Clone)]
+pub struct WantedEvents {
+    pub key: ConnectionKey,
+    /// Only events of places of these cameras and sites.
+    pub scopes: HashSet<TrackScope>,
+    pub topic: Topic,
 }
 
 /// The log of positions of one sink.
@@ -157,6 +169,7 @@ pub struct SinkFeeds {
 struct Feeds {
     by_sink: HashMap<ConnectionKey, Arc<SinkFeed>>,
     by_camera: HashMap<CameraId, Vec<Arc<SinkFeed>>>,
+    of_events: Vec<WantedEvents>,
 }
 
 impl SinkFeeds {
@@ -171,9 +184,16 @@ impl SinkFeeds {
         self.log
     }
 
-    /// From now on these sinks get positions. What waits for others stays, as long as they are among `sinks`.
-    pub fn feed(&self, sinks: &HashSet<ConnectionKey>, wanted: &[WantedPositions]) {
-        let mut feeds = Feeds { by_sink: self.feeds.load().by_sink.clone(), ..Feeds::default() };
+    /// From now on these sinks get positions, and those get events. What waits for others stays, as long as they are among
+    /// `sinks`.
+    pub fn feed(
+        &self,
+        sinks: &HashSet<ConnectionKey>,
+        wanted: &[WantedPositions],
+        of_events: Vec<WantedEvents>,
+    ) {
+        let by_sink = self.feeds.load().by_sink.clone();
+        let mut feeds = Feeds { by_sink, of_events, ..Feeds::default() };
         feeds.by_sink.retain(|key, _| sinks.contains(key));
         for WantedPositions { key, cameras, min_interval_s } in wanted {
             let feed = feeds.by_sink.entry(*key).or_insert_with(SinkFeed::new);
@@ -196,6 +216,26 @@ impl SinkFeeds {
         for feed in self.feeds.load().by_camera.get(camera).into_iter().flatten() {
             feed.push(camera, observation, point);
         }
+    }
+
+    /// The messages that sinks are to have of an event.
+    pub(in crate::app) fn messages_of_event(
+        &self,
+        scope: &TrackScope,
+        event: &PlaceEvent,
+        content: &str,
+        now: Timestamp,
+    ) -> Vec<(ConnectionKey, OutboxMessage)> {
+        let feeds = self.feeds.load();
+        let sinks = feeds.of_events.iter().filter(|sink| sink.scopes.contains(scope));
+        let message = |sink: &WantedEvents| OutboxMessage {
+            number: 0,
+            message_id: event.id.clone(),
+            subject: sink.topic.of_event(&event.place_id, event.kind.as_str()),
+            payload: content.as_bytes().to_vec(),
+            created_at: now,
+        };
+        sinks.map(|sink| (sink.key, message(sink))).collect()
     }
 
     /// Waits until nothing is to come any more.

@@ -19,7 +19,7 @@ use crate::app::cluster::CameraLease;
 use crate::app::registry::ActiveCamera;
 use crate::domain::{
     CameraId, CameraMoved, Detection, Durability, Error, ErrorKind, LiveItem, Observation, Result, Sample,
-    Score, TargetClass, check_text,
+    Score, check_text,
 };
 
 /// How long a request waits until its items are decided by what comes after them; then they are decided.
@@ -89,36 +89,54 @@ struct StreamRecording {
     tracker: Arc<AckTracker>,
 }
 
-impl App {
+/// The pairing that all storing streams of the camera share.
+fn recorder_of(app: &App, camera: &ActiveCamera) -> Arc<SampleRecorder> {
+    let mut shared = lock(&camera.live.recorder);
+    match shared.upgrade().filter(|recorder| !recorder.has_failed()) {
+        Some(recorder) => recorder,
+        None => {
+            let sink = SampleSink {
+                store: app.store.clone(),
+                metrics: app.metrics.clone(),
+                id: camera.id.clone(),
+                key: camera.key,
+            };
+            let recorder = sample_committer::start(sink, |task| drop(app.tasks.spawn(task)));
+            *shared = Arc::downgrade(&recorder);
+            recorder
+        }
+    }
+}
+
+impl LiveStream {
     /// Opens a live stream of one client for one camera. With `store_samples` boxes and fixes are
     /// paired and stored, and items acknowledged, both with that durability.
     ///
     /// # Errors
     /// `CameraNotFound`; `InvalidArgument` naming `client_name`; `Overloaded` beyond the limits of
     /// streams; `CameraOnOtherNode`, `CameraBetweenNodes`.
-    pub async fn open_stream(
-        &self,
+    pub async fn open(
+        app: &App,
         id: &CameraId,
         client_name: &str,
         client_id: ClientId,
         resume_after_seq: u64,
         store_samples: Option<Durability>,
-    ) -> Result<LiveStream> {
+    ) -> Result<Self> {
         check_text("client_name", client_name, LONGEST_CLIENT_NAME)?;
-        self.active_camera(id).await?;
-        let limits = &self.limits;
+        app.active_camera(id).await?;
+        let limits = &app.limits;
         // Names are the client's choice; its address is not.
-        let client_lease = self.quotas.live_streams.try_acquire(client_id, 1)?;
-        let slot =
-            self.stream_slots.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
-        let (camera, lease) = self.own_camera(id).await?;
+        let client_lease = app.quotas.live_streams.try_acquire(client_id, 1)?;
+        let slot = app.stream_slots.take(client_name, limits.live_streams, limits.live_streams_per_client)?;
+        let (camera, lease) = app.nodes().own_camera(id).await?;
         let recording = store_samples.map(|durability| StreamRecording {
-            recorder: self.recorder_of(&camera),
+            recorder: recorder_of(app, &camera),
             tracker: AckTracker::beginning_after(resume_after_seq, durability),
         });
-        self.metrics.stream_opened();
-        Ok(LiveStream {
-            app: self.clone(),
+        app.metrics.stream_opened();
+        Ok(Self {
+            app: app.clone(),
             _count: camera.live.count_stream(),
             camera,
             lease: Some(lease),
@@ -129,25 +147,25 @@ impl App {
         })
     }
 
-    /// Answers observations as [`App::follow`] and stores samples of them, and of what the camera's streams
+    /// Answers observations as [`Live::follow`](super::Live::follow) and stores samples of them, and of what the camera's streams
     /// bring. Returns when it is decided what becomes of each.
     ///
     /// # Errors
-    /// As [`App::open_stream`] and [`App::follow`]; the samples could not be stored.
+    /// As [`LiveStream::open`] and [`Live::follow`](super::Live::follow); the samples could not be stored.
     pub async fn follow_and_store(
-        &self,
+        app: &App,
         camera: &Arc<ActiveCamera>,
         observations: Vec<Observation>,
         client: ClientId,
         durability: Durability,
     ) -> Result<(Vec<ItemResult>, Acknowledgement)> {
         let name = format!("requests of {}", camera.id);
-        let mut stream = self.open_stream(&camera.id, &name, client, 0, Some(durability)).await?;
+        let mut stream = Self::open(app, &camera.id, &name, client, 0, Some(durability)).await?;
         let mut followed = Vec::with_capacity(observations.len());
         for (seq, observation) in (1..).zip(observations) {
             stream.check_seq(seq)?;
-            let now = self.clock.now();
-            followed.push(stream.observe(camera, (seq, now), observation, (None, None)).await?);
+            let now = app.clock.now();
+            followed.push(stream.observe(camera, (seq, now), observation, None).await?);
         }
         // Deciding early would take other requests' and streams' items from each other.
         stream.settle_within(PAIRING_PATIENCE).await?;
@@ -155,27 +173,6 @@ impl App {
         Ok((followed, acknowledgement.ok_or_else(|| Error::fault("a stream that stores nothing"))?))
     }
 
-    /// The pairing that all storing streams of the camera share.
-    fn recorder_of(&self, camera: &ActiveCamera) -> Arc<SampleRecorder> {
-        let mut shared = lock(&camera.live.recorder);
-        match shared.upgrade().filter(|recorder| !recorder.has_failed()) {
-            Some(recorder) => recorder,
-            None => {
-                let sink = SampleSink {
-                    store: self.store.clone(),
-                    metrics: self.metrics.clone(),
-                    id: camera.id.clone(),
-                    key: camera.key,
-                };
-                let recorder = sample_committer::start(sink, |task| drop(self.tasks.spawn(task)));
-                *shared = Arc::downgrade(&recorder);
-                recorder
-            }
-        }
-    }
-}
-
-impl LiveStream {
     /// The model version that answers now.
     #[must_use]
     pub fn model_version(&self) -> Option<u32> {
@@ -250,7 +247,7 @@ impl LiveStream {
     ///
     /// # Errors
     /// `CameraBetweenNodes`, which ends the stream; `InvalidArgument` for neither box nor fix, or for a time ahead of the server's clock, naming the
-    /// field; as [`App::follow`].
+    /// field; as [`Live::follow`](super::Live::follow).
     pub async fn take(
         &self,
         camera: &Arc<ActiveCamera>,
@@ -268,7 +265,7 @@ impl LiveStream {
         };
         let observation =
             Observation::new(time, target_id, item.bounding_box, fix)?.with_tracker_id(item.tracker_id)?;
-        self.observe(camera, (seq, now), observation, (item.class, item.score)).await
+        self.observe(camera, (seq, now), observation.with_class(item.class), item.score).await
     }
 
     /// Takes an observation as [`LiveStream::take`] does. The lease is checked where the live state changes; a sample that
@@ -278,43 +275,39 @@ impl LiveStream {
         camera: &Arc<ActiveCamera>,
         (seq, now): (u64, Timestamp),
         observation: Observation,
-        (class, score): (Option<TargetClass>, Option<Score>),
+        score: Option<Score>,
     ) -> Result<ItemResult> {
         // A time that no track takes must not move the pairing either.
         let time = observation.time();
-        self.app.live_time_bounds(now).check(time)?;
+        self.app.limits.live_time_bounds(now).check(time)?;
         if let Some(bounding_box) = observation.bounding_box().filter(|_| camera.model().is_none()) {
             camera.live.announce_box(self.app.clock.monotonic(), || UnplacedBox {
                 time,
                 target_id: observation.target_id().cloned(),
                 tracker_id: observation.tracker_id().cloned(),
                 bounding_box,
-                class: class.clone(),
+                class: observation.class().cloned(),
                 score,
             });
         }
-        let identified = self.app.identify(camera, observation, class.as_ref());
+        let live = self.app.live();
+        let identified = live.identify(camera, observation);
         if identified.is_sure {
-            self.record(seq, &identified.observation, class, score).await?;
+            self.record(seq, &identified.of_sample(), score).await?;
         } else {
             self.ack_without_storing(seq, NotStoredReason::Unmatched);
         }
-        self.app.follow_identified((camera, self.lease()?), identified, now)
+        live.follow_identified((camera, self.lease()?), identified, now)
     }
 
-    async fn record(
-        &self,
-        seq: u64,
-        observation: &Observation,
-        class: Option<TargetClass>,
-        score: Option<Score>,
-    ) -> Result<()> {
+    async fn record(&self, seq: u64, observation: &Observation, score: Option<Score>) -> Result<()> {
         let Some(StreamRecording { recorder, tracker }) = &self.recording else { return Ok(()) };
         let time = observation.time();
         let Some(target_id) = observation.target_id().cloned() else {
             self.ack_without_storing(seq, NotStoredReason::NoTarget);
             return Ok(());
         };
+        let class = observation.class().cloned();
         match (observation.bounding_box(), observation.fix()) {
             (Some(bounding_box), Some(fix)) => {
                 let sample = Sample { time, target_id, bounding_box, fix, class, score, truth: None };

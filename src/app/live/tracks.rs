@@ -10,8 +10,12 @@ use std::time::Duration;
 
 use super::history::History;
 use super::sync::lock;
+use crate::app::history::path::{FinishedTrack, RecordedState};
+use crate::app::history::recorder::TrackRecorder;
 use crate::config::Limits;
-use crate::domain::{CameraId, Error, ErrorKind, ImageSize, Observation, Result, TargetId};
+use crate::domain::{
+    CameraId, Error, ErrorKind, ImageSize, Observation, ReceiverMatch, Result, TargetClass, TargetId,
+};
 use crate::fusion::drift_detector::{ResidualSample, TimeAligner, TimedEstimate};
 use crate::fusion::observed::ObservedPositions;
 use crate::fusion::target_track::{TargetTrack, TrackEstimate};
@@ -26,6 +30,8 @@ const EVICT_AFTER: Duration = Duration::from_secs(2);
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrackPoint {
     pub target_id: TargetId,
+    /// The receiver that the target carries, where only a tracker's id is known and it was matched.
+    pub receiver_match: Option<ReceiverMatch>,
     /// The target's position.
     pub position: Position,
     /// All that the track states, in its own plane.
@@ -45,11 +51,14 @@ pub(super) struct TrackedTarget {
     last_item_at: Duration,
     history: History<TrackPoint>,
     residuals: ResidualSource,
+    /// Only where the camera has a history.
+    recorder: Option<TrackRecorder>,
 }
 
 /// One instant of one target.
 pub(super) struct TargetObservation<'a> {
     pub(super) target_id: &'a TargetId,
+    pub(super) receiver_match: Option<&'a ReceiverMatch>,
     pub(super) observed: ObservedPositions<'a>,
     pub(super) model: Option<(&'a Regressor, u32)>,
     /// Reading of the monotonic clock.
@@ -57,6 +66,18 @@ pub(super) struct TargetObservation<'a> {
 }
 
 impl Tracks {
+    /// Removes the targets that have not been observed for too long, which ends their recordings.
+    pub(super) fn remove_silent(&self, now: Duration) {
+        remove_expired(&mut lock(&self.targets), now);
+    }
+
+    /// Ends all recordings.
+    pub(super) fn finish_all(&self) -> Vec<FinishedTrack> {
+        let targets = lock(&self.targets);
+        let recorders = targets.values().filter_map(|target| lock(target).recorder.take());
+        recorders.filter_map(TrackRecorder::finish).collect()
+    }
+
     /// The latest point of every target, by target.
     pub(super) fn latest(&self, now: Duration) -> Vec<Arc<TrackPoint>> {
         let mut targets = lock(&self.targets);
@@ -109,6 +130,14 @@ impl Tracks {
         targets.insert(target_id.clone(), target.clone());
         Ok(target)
     }
+
+    /// Compares a box with the fixes of the receiver that it was matched with, whose track is another.
+    pub(super) fn compared_with_fixes(&self, seen: &TargetObservation<'_>) -> Option<ResidualSample> {
+        let carried = TargetId::from(seen.receiver_match?.receiver_id.clone());
+        let target = lock(&self.targets).get(&carried).cloned()?;
+        let residual = lock(&target).residuals.observe(seen);
+        residual.map(|own| ResidualSample { target_id: carried, ..own })
+    }
 }
 
 type Targets = HashMap<TargetId, Arc<Mutex<TrackedTarget>>>;
@@ -157,9 +186,38 @@ impl TrackedTarget {
         let estimate = self.track.update(&seen.observed, settings);
         let residual = self.residuals.observe(seen);
         let Some(TrackEstimate { position, state }) = estimate else { return (None, residual) };
-        let point = Arc::new(TrackPoint { target_id: seen.target_id.clone(), position, state });
+        let receiver_match = seen.receiver_match.cloned();
+        let point =
+            Arc::new(TrackPoint { target_id: seen.target_id.clone(), receiver_match, position, state });
         self.history.push(&point, |point| point.state.time, limits.track_points);
         (Some(point), residual)
+    }
+
+    /// Records the estimate, with the recorder of the camera's history as it is now.
+    pub(super) fn record(
+        &mut self,
+        point: &TrackPoint,
+        class: Option<&TargetClass>,
+        recorder: Option<impl FnOnce() -> TrackRecorder>,
+    ) {
+        let Some(recorder) = recorder else {
+            self.recorder = None;
+            return;
+        };
+        let state = &point.state;
+        self.recorder.get_or_insert_with(recorder).push(&RecordedState {
+            track: None,
+            target: Some(&point.target_id),
+            class,
+            time: state.time,
+            position: point.position,
+            velocity: state.velocity,
+            covariance: state.normal_covariance(),
+            velocity_covariance: state.velocity_covariance,
+            stationary_probability: state.stationary_probability,
+            moments: state.moments,
+            is_restarted: state.restarted,
+        });
     }
 
     fn new(now: Duration) -> Self {
@@ -168,6 +226,7 @@ impl TrackedTarget {
             last_item_at: now,
             history: History::default(),
             residuals: ResidualSource::default(),
+            recorder: None,
         }
     }
 }

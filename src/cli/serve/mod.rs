@@ -78,15 +78,11 @@ impl Serve {
             }
             let has_tls = server.has_tls();
             let serving = tokio::spawn(server.run());
-            let shown = if self.demo { demonstration::show(&app, address).await } else { Ok(()) };
+            // Without TLS and keys the simulated devices are let in as everybody on this machine is.
+            let moves = !has_tls && app.access.is_open();
+            let shown = if self.demo { demonstration::show(&app, address, moves).await } else { Ok(()) };
             if shown.is_err() {
                 shutdown.drain();
-            } else if self.demo && !has_tls && app.access.is_open() {
-                tokio::spawn(async move {
-                    if let Err(error) = demonstration::run(&app, address, Clock::system().now()).await {
-                        tracing::error!(%error, "the targets of the demonstration do not move");
-                    }
-                });
             }
             serving.await.context("the server task panicked")??;
             log.close();

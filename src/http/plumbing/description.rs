@@ -18,14 +18,16 @@ use crate::http::resources::session::SESSION_COOKIE;
 use crate::operations::route_permission;
 use crate::status;
 
-const TAGS: [(&str, &str); 13] = [
+const TAGS: [(&str, &str); 15] = [
     ("cameras", "Profiles of cameras that nobody calibrated"),
     ("sites", "Cameras whose targets are tracked together"),
+    ("places", "Areas and lines on the ground: rules, events and statistics"),
     ("samples", "Boxes and fixes that cameras learn from"),
     ("training", "Background fits of a camera's model"),
     ("models", "Model versions that runs yield"),
     ("fusion", "Positions of targets"),
     ("tracks", "Targets as they move: tracks, histories and live events"),
+    ("history", "Positions of finished tracks"),
     ("inference", "The Open Inference Protocol (KServe's V2): positions of boxes as tensors"),
     ("features", "OGC API Features: cameras, samples and tracks for GIS"),
     ("connections", "Other systems that give detections and fixes, or take positions"),
@@ -95,6 +97,9 @@ pub(in crate::http) fn add_problems(openapi: &mut OpenApi) {
             }
             if path.contains("{connection}") {
                 kinds.extend(BELOW_CONNECTION);
+            }
+            if path.contains("{place}") {
+                kinds.push(ErrorKind::PlaceNotFound);
             }
             if path.contains("{site}") {
                 kinds.extend(BELOW_SITE);

@@ -13,8 +13,8 @@ use super::body;
 use super::problem::{ApiError, ApiResult, no_route};
 use crate::admission::ClientId;
 use crate::domain::{
-    CameraId, ConnectionId, Durability, Error, ErrorKind, EvaluationId, LiveId, OnConflict, Result, RunId,
-    SiteId, TargetId, parse_time, parse_time_zone,
+    CameraId, ConnectionId, Durability, Error, ErrorKind, EvaluationId, LiveId, OnConflict, PlaceId, Result,
+    RunId, SiteId, TargetId, TrackScope, parse_time, parse_time_zone,
 };
 use crate::exchange::{CsvLayout, Cursor, Format, read_cursor, wire};
 use crate::http::plumbing::state::Rest;
@@ -69,6 +69,19 @@ impl<S: Send + Sync> FromRequestParts<S> for SitePath {
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
         Ok(Self(site_of(&path::<SiteSegment, S>(parts, state).await?.site)?))
+    }
+}
+
+/// A place of the path. What is no slug names none.
+pub(in crate::http) struct PlacePath(pub(in crate::http) PlaceId);
+
+impl<S: Send + Sync> FromRequestParts<S> for PlacePath {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> ApiResult<Self> {
+        let id = PlaceId::new(&path::<PlaceSegment, S>(parts, state).await?.place);
+        let none = || Error::refused(ErrorKind::PlaceNotFound, "that is not the id of a place");
+        Ok(Self(id.map_err(|_| none())?))
     }
 }
 
@@ -178,6 +191,11 @@ struct ConnectionSegment {
 }
 
 #[derive(Deserialize)]
+struct PlaceSegment {
+    place: String,
+}
+
+#[derive(Deserialize)]
 struct SiteSegment {
     site: String,
 }
@@ -242,6 +260,16 @@ pub(in crate::http) fn site_of(id: &str) -> Result<SiteId> {
         let shown: String = id.chars().take(80).collect();
         Error::refused(ErrorKind::SiteNotFound, format!("`{shown}` is not the id of a site"))
     })
+}
+
+/// The scope that the parameters `site` and `camera` ask for, of which one is given at most.
+pub(in crate::http) fn scope_of(params: &mut Params) -> Result<Option<TrackScope>> {
+    let site = params.take("site", site_of)?.map(TrackScope::Site);
+    let camera = params.take("camera", camera_of)?.map(TrackScope::Camera);
+    match (site, camera) {
+        (Some(_), Some(_)) => Err(Error::invalid("site", "give either site or camera")),
+        (site, camera) => Ok(site.or(camera)),
+    }
 }
 
 /// Query parameters, each taken at most once; what nobody takes is refused.

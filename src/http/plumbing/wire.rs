@@ -124,6 +124,16 @@ pub(in crate::http) fn json_of_about(value: &impl Serialize, bytes: usize) -> Re
     Ok(response)
 }
 
+/// The media type of GeoJSON (RFC 7946).
+pub(in crate::http) const GEOJSON: &str = "application/geo+json";
+
+/// A 200 of GeoJSON.
+pub(in crate::http) fn geojson(value: &impl Serialize) -> Result<Response> {
+    let mut response = json(value)?;
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(GEOJSON));
+    Ok(response)
+}
+
 /// A 201 or 202 of JSON, with the path of what was created.
 pub(in crate::http) fn created(
     status: StatusCode,

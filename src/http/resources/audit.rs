@@ -100,7 +100,7 @@ async fn list_audit_entries(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let limit = params.limit(app.limits.page_items)?;
     let before = params.cursor()?;
     params.end()?;
-    let page = app.audit_log(camera.as_ref(), before, limit).await?;
+    let page = app.audit_log().list(camera.as_ref(), before, limit).await?;
     Ok(json(&AuditPage {
         items: page.items.into_iter().map(AuditEntry::from).collect(),
         next_cursor: page.next.map(|number| write_cursor(&number)),

@@ -122,7 +122,7 @@ async fn list_camera_statuses(CallerApp(app): CallerApp, uri: Uri) -> ApiResult 
     let limit = params.limit(app.limits.page_items)?;
     let after = params.cursor()?;
     params.end()?;
-    let page = app.camera_statuses(after.as_ref(), limit).await?;
+    let page = app.camera_statuses().list(after.as_ref(), limit).await?;
     Ok(json(&CameraStatusPage {
         items: page.items.into_iter().map(|status| CameraStatus::of(&app, status)).collect(),
         next_cursor: page.next.map(|id| write_cursor(&id)),

@@ -9,6 +9,7 @@ use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::history::HistorySettings;
 use super::receivers::{Receiver, receivers, shown};
 use crate::app::App;
 use crate::domain::{
@@ -154,6 +155,8 @@ struct CameraDraft {
     site: Option<String>,
     /// Where a still picture is fetched, if the camera or another program offers one.
     snapshot: Option<SnapshotSource>,
+    /// How finished tracks are kept; none are if left out.
+    history: Option<HistorySettings>,
 }
 
 impl CameraDraft {
@@ -174,6 +177,7 @@ impl CameraDraft {
             learn_automatically: self.learn_automatically.unwrap_or(blank.learn_automatically),
             site: self.site.as_deref().map(SiteId::new).transpose().map_err(|error| error.at("site"))?,
             snapshot: self.snapshot.map(SnapshotSource::into_domain).transpose()?,
+            history: self.history.map(HistorySettings::to_domain).transpose()?,
             id: blank.id,
         })
     }
@@ -224,6 +228,8 @@ struct CameraChange {
     site: Option<String>,
     /// New address of a still picture; null forgets it.
     snapshot: Option<SnapshotSource>,
+    /// New settings of the history; null keeps no more tracks. What is kept already stays until it is deleted or too old.
+    history: Option<HistorySettings>,
 }
 
 /// The change that a merge patch makes of a stored camera.
@@ -271,6 +277,9 @@ pub(super) struct Camera {
     /// Where a still picture is fetched, if stated; without the password.
     #[serde(skip_serializing_if = "Option::is_none")]
     snapshot: Option<SnapshotSource>,
+    /// How finished tracks are kept; missing if none are.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    history: Option<HistorySettings>,
     /// Counts the changes of the profile, from 1.
     revision: u64,
     /// When it was made.
@@ -298,7 +307,7 @@ pub(super) struct Camera {
 
 impl Camera {
     pub(super) fn of(app: &App, camera: domain::Camera) -> Self {
-        let moved = app.camera_moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
+        let moved = app.cameras().moved(camera.id()).map(|moved| CameraMoved::from(&*moved));
         let model_fault = app.models().fault(camera.id()).map(|fault| fault.reason);
         let warnings = app.cameras().warnings(&camera);
         let domain::Camera { profile, revision, created_at, updated_at, active_model, samples, key: _ } =
@@ -320,6 +329,7 @@ impl Camera {
             learn_automatically: profile.learn_automatically,
             site: profile.site.map(|site| site.as_str().to_owned()),
             snapshot: profile.snapshot.as_ref().map(SnapshotSource::shown),
+            history: profile.history.map(Into::into),
             revision: revision.0,
             created_at,
             updated_at,

@@ -252,7 +252,7 @@ impl Connection {
 
     /// With what it does now.
     async fn with_status(app: &App, connection: domain::Connection) -> Result<Self> {
-        let (status, node, outbox) = app.connection_status(&connection).await?;
+        let (status, node, outbox) = app.connections().status(&connection).await?;
         let status = ConnectionStatus {
             state: status.state.into(),
             node: node.map(|node| ConnectionNode { id: node.id.to_string(), url: node.url }),
@@ -348,7 +348,7 @@ struct DeadLetterCount {
     )
 )]
 async fn create_connection(CallerApp(app): CallerApp, body: JsonBody) -> ApiResult {
-    let connection = app.create_connection(body.read::<ConnectionDraft>()?.try_into()?).await?;
+    let connection = app.connections().create(body.read::<ConnectionDraft>()?.try_into()?).await?;
     let (location, version) = (format!("/v1/connections/{}", connection.id()), connection.version());
     let shown = Connection::of(connection)?;
     Ok(with_etag(created(StatusCode::CREATED, &location, &shown)?, version).await?)
@@ -368,7 +368,7 @@ async fn list_connections(CallerApp(app): CallerApp, uri: Uri) -> ApiResult {
     let limit = params.limit(app.limits.page_items)?;
     let after = params.cursor()?;
     params.end()?;
-    let page = app.connections(after.as_ref(), limit).await?;
+    let page = app.connections().list(after.as_ref(), limit).await?;
     let mut items = Vec::with_capacity(page.items.len());
     for connection in page.items {
         items.push(Connection::with_status(&app, connection).await?);
@@ -393,7 +393,7 @@ async fn get_connection(
     ConnectionPath(id): ConnectionPath,
     headers: HeaderMap,
 ) -> ApiResult {
-    let connection = app.connection(&id).await?;
+    let connection = app.connections().get(&id).await?;
     let version = connection.version();
     let shown = Connection::with_status(&app, connection).await?;
     Ok(unless_known(&headers, with_etag(json(&shown)?, version).await?))
@@ -427,12 +427,12 @@ async fn change_connection(
     let mut patch = body.read::<JsonObject>()?;
     let secrets = secrets_of(patch.remove("secrets"))?;
     let change = || async {
-        let connection = app.connection(&id).await?;
+        let connection = app.connections().get(&id).await?;
         let version = expected.unwrap_or(connection.version());
         let document = merge_patch::merged(&Connection::of(connection)?, &patch, &PATCHED)?;
         let mut request = ConnectionRequest::try_from(parse_json::<ConnectionDraft>(&document)?)?;
         request.secrets.clone_from(&secrets);
-        app.change_connection(request, version).await
+        app.connections().change(request, version).await
     };
     let changed = merge_patch::retried(expected.is_some(), change).await?;
     let version = changed.version();
@@ -463,7 +463,7 @@ async fn delete_connection(
     ConnectionPath(id): ConnectionPath,
     headers: HeaderMap,
 ) -> ApiResult {
-    app.delete_connection(&id, etag::optional(&headers)?).await?;
+    app.connections().delete(&id, etag::optional(&headers)?).await?;
     Ok(empty())
 }
 
@@ -491,7 +491,7 @@ async fn test_connection(
         seconds.ok_or_else(|| Error::invalid("wait_s", format!("must be from 1 to {MAX_TRIAL_S}")))
     })?;
     params.end()?;
-    let connection = app.connection(&id).await?;
+    let connection = app.connections().get(&id).await?;
     let tried = try_connection(&app, &connection, Duration::from_secs(wait_s.unwrap_or(TRIAL_S))).await?;
     Ok(json(&Trial { message: tried.message.map(Into::into), error: tried.error })?)
 }
@@ -537,7 +537,7 @@ async fn taken(
     ConnectionPath(id): ConnectionPath,
     PushedBody(message): PushedBody,
 ) -> ApiResult {
-    let answer = app.push_message(&id, message).await?;
+    let answer = app.connections().push(&id, message).await?;
     Ok(answer.map_or_else(empty, json_text))
 }
 
@@ -632,7 +632,7 @@ async fn list_dead_letters(
         text.parse().map_err(|_| Error::invalid("cursor", "must be the `next_cursor` of the page before"))
     })?;
     params.end()?;
-    let page = app.dead_letters(&id, after.unwrap_or(0), limit).await?;
+    let page = app.connections().dead_letters(&id, after.unwrap_or(0), limit).await?;
     let shown = |letter: domain::DeadLetter| DeadLetter {
         number: letter.message.number,
         id: letter.message.message_id,
@@ -654,7 +654,7 @@ async fn list_dead_letters(
     responses((status = 200, description = "How many there were", body = DeadLetterCount))
 )]
 async fn delete_dead_letters(CallerApp(app): CallerApp, ConnectionPath(id): ConnectionPath) -> ApiResult {
-    Ok(json(&DeadLetterCount { dead_letters: app.delete_dead_letters(&id).await? })?)
+    Ok(json(&DeadLetterCount { dead_letters: app.connections().delete_dead_letters(&id).await? })?)
 }
 
 /// Try the dead letters of a sink again
@@ -664,5 +664,5 @@ async fn delete_dead_letters(CallerApp(app): CallerApp, ConnectionPath(id): Conn
     responses((status = 200, description = "How many there were", body = DeadLetterCount))
 )]
 async fn retry_dead_letters(CallerApp(app): CallerApp, ConnectionPath(id): ConnectionPath) -> ApiResult {
-    Ok(json(&DeadLetterCount { dead_letters: app.retry_dead_letters(&id).await? })?)
+    Ok(json(&DeadLetterCount { dead_letters: app.connections().retry_dead_letters(&id).await? })?)
 }

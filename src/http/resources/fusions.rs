@@ -44,6 +44,8 @@ pub(super) struct Request<'a> {
     tracker_id: Option<wire::Text<'a>>,
     bounding_box: Option<wire::BoundingBox>,
     fix: Option<wire::Fix>,
+    #[serde(borrow)]
+    class: Option<wire::Text<'a>>,
 }
 
 /// Observations of one camera.
@@ -111,7 +113,7 @@ async fn fuse(
         FormattedBody::Json(json) => observations(&app, &json.read()?, &rules, &camera.receivers)?,
         FormattedBody::Rows(rows, format) => observed_rows(&app, rows, *format, &rules)?,
     };
-    let fused = app.fuse_batch(camera, &observations).await?;
+    let fused = app.fusion().fuse(camera, &observations).await?;
     let mut response = match written {
         Format::Json => {
             let items = fused.iter().map(wire::FusedFix::from).collect();
@@ -137,7 +139,7 @@ fn observed_rows(app: &App, content: &[u8], format: Format, rules: &RowRules) ->
     // Reads at most limit + 1 observations, to detect an oversized batch.
     let rows = read_observations(content, format, rules)?.take(app.limits.batch_observations + 1);
     let rows = rows.collect::<Result<Vec<_>>>()?;
-    app.check_batch(rows.len())?;
+    app.limits.check_batch(rows.len())?;
     let faults = rows.iter().filter_map(|row| row.as_ref().err());
     let violations = faults.map(|row| (format!("line {}: {}", row.line, row.field), row.reason.clone()));
     Error::check_all("nothing was done, for the rows at fault", violations)?;
@@ -159,6 +161,7 @@ pub(super) fn observations(
             tracker_id: request.tracker_id.clone(),
             bounding_box: request.bounding_box,
             fix: request.fix,
+            class: request.class.clone(),
         };
         return Ok(vec![one.to_domain(time_bounds, *image_size, receivers)?]);
     };
@@ -169,11 +172,12 @@ pub(super) fn observations(
         ("tracker_id", request.tracker_id.is_some()),
         ("bounding_box", request.bounding_box.is_some()),
         ("fix", request.fix.is_some()),
+        ("class", request.class.is_some()),
     ];
     if let Some((field, _)) = beside.into_iter().find(|(_, given)| *given) {
         return Err(Error::invalid(field, "belongs into one of the observations"));
     }
-    app.check_batch(batch.len())?;
+    app.limits.check_batch(batch.len())?;
     convert_all("observations", batch, |observation| {
         observation.to_domain(time_bounds, *image_size, receivers)
     })

@@ -419,7 +419,7 @@ async fn model_version_metadata(CallerApp(app): CallerApp, model: ModelName) -> 
 }
 
 async fn metadata(app: &App, model: ModelName) -> ApiResult {
-    let (_, version) = app.served_model(&model.camera, model.version.as_deref()).await?;
+    let (_, version) = app.inference().served_model(&model.camera, model.version.as_deref()).await?;
     let tensor = |name, columns: usize| TensorMetadata { name, datatype: FP64, shape: [ANY, columns as i64] };
     Ok(json(&InferenceModelMetadata {
         name: model.camera.to_string(),
@@ -458,7 +458,7 @@ async fn model_version_ready(CallerApp(app): CallerApp, model: ModelName) -> Api
 }
 
 async fn ready(app: &App, model: ModelName) -> ApiResult {
-    app.served_model(&model.camera, model.version.as_deref()).await?;
+    app.inference().served_model(&model.camera, model.version.as_deref()).await?;
     Ok(json(&ModelReady { name: model.camera.to_string(), ready: true })?)
 }
 
@@ -502,9 +502,9 @@ async fn inferred(app: &App, model: ModelName, body: &InferenceBody) -> ApiResul
         return Err(Error::invalid("inputs", format!("must be one tensor, `{BOXES}`")).into());
     };
     let data = input.elements(&body.elements, app.limits.batch_observations)?;
-    app.check_batch(data.count.div_ceil(BOX_COLUMNS)).map_err(|error| error.at(BOXES))?;
+    app.limits.check_batch(data.count.div_ceil(BOX_COLUMNS)).map_err(|error| error.at(BOXES))?;
     let boxes = boxes(input, &data.numbers)?;
-    let answer = app.infer(&model.camera, model.version.as_deref(), boxes, &outputs).await?;
+    let answer = app.inference().infer(&model.camera, model.version.as_deref(), boxes, &outputs).await?;
     let Inferred { version, outputs } = answer;
     let numbers: usize = outputs.iter().map(|(_, numbers)| numbers.len()).sum();
     let outputs = outputs.into_iter().map(|(output, data)| OutputData {

@@ -113,5 +113,5 @@ impl From<app::Learning> for Learning {
     )
 )]
 async fn get_learning(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
-    Ok(json(&Learning::from(app.learning(&id).await?))?)
+    Ok(json(&Learning::from(app.recordings().learning(&id).await?))?)
 }

@@ -11,16 +11,19 @@ mod evaluations;
 mod features;
 mod fusions;
 mod gnss_error;
+mod heat_map;
+mod history;
 mod inference;
 mod inference_body;
 mod keys;
 mod learning;
 mod models;
-mod moving_features;
 mod nodes;
 mod openid;
 mod pairings;
 mod pictures;
+mod place_events;
+mod places;
 mod receivers;
 mod runs;
 mod samples;
@@ -51,6 +54,8 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .merge(sites::routes())
         .merge(site_training_runs::routes())
         .merge(world_tracks::routes())
+        .merge(places::routes())
+        .merge(place_events::routes())
         .merge(connections::routes())
         .merge(samples::routes())
         .merge(pairings::routes())
@@ -58,6 +63,8 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
         .merge(models::routes())
         .merge(fusions::routes())
         .merge(tracks::routes())
+        .merge(history::routes())
+        .merge(heat_map::routes())
         .merge(gnss_error::routes())
         .merge(evaluations::routes())
         .merge(inference::routes())

@@ -81,6 +81,6 @@ struct Nodes {
     responses((status = 200, description = "Nodes, by the time of their start", body = Nodes))
 )]
 async fn list_nodes(CallerApp(app): CallerApp) -> ApiResult {
-    let items = app.nodes().await?.into_iter().map(Into::into).collect();
+    let items = app.nodes().list().await?.into_iter().map(Into::into).collect();
     Ok(json(&Nodes { items })?)
 }

@@ -38,7 +38,7 @@ struct PictureFile(Vec<u8>);
     )
 )]
 async fn get_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
-    Ok(app.picture(&id).await?.map_or_else(empty, shown))
+    Ok(app.pictures().get(&id).await?.map_or_else(empty, shown))
 }
 
 /// Fetch a new picture of what a camera sees
@@ -84,7 +84,7 @@ async fn set_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath, requ
     let format = readable.into_iter().find(|format| given == Some(format.media_type()));
     let format = format.ok_or_else(|| not_read(&readable.map(PictureFormat::media_type)))?;
     let content = body::whole(&parts.headers, content, app.limits.picture_bytes).await?;
-    app.set_picture(&id, Some(&Picture::new(format, content.into())?)).await?;
+    app.pictures().set(&id, Some(&Picture::new(format, content.into())?)).await?;
     Ok(empty())
 }
 
@@ -95,6 +95,6 @@ async fn set_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath, requ
     responses((status = 204, description = "There is none now"))
 )]
 async fn delete_picture(CallerApp(app): CallerApp, CameraPath(id): CameraPath) -> ApiResult {
-    app.set_picture(&id, None).await?;
+    app.pictures().set(&id, None).await?;
     Ok(empty())
 }

@@ -56,7 +56,7 @@ async fn readyz(State(rest): State<Rest>, CallerApp(app): CallerApp) -> ApiResul
         Err(_) => return Err(slow_store().into()),
     }
     app.access.check_confirmed(app.clock.monotonic())?;
-    let history = app.database_history();
+    let history = app.nodes().database_history();
     if history == DatabaseHistory::Reading {
         let message = "the history of the database has changed; everything is read again";
         return Err(Error::refused(ErrorKind::Overloaded, message).into());

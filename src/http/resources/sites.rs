@@ -9,6 +9,7 @@ use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
+use super::history::HistorySettings;
 use crate::domain::{self, NewSite, Result, SiteId};
 use crate::exchange::wire::{Position, parse_json};
 use crate::exchange::write_cursor;
@@ -44,6 +45,8 @@ struct SiteDraft {
     /// Origin of the plane in which targets are tracked; that of the first camera's model if left out. Targets
     /// farther than 20 km from it are not tracked.
     origin: Option<Position>,
+    /// How finished world tracks are kept; none are if left out.
+    history: Option<HistorySettings>,
 }
 
 impl SiteDraft {
@@ -54,6 +57,7 @@ impl SiteDraft {
             display_name: self.display_name.unwrap_or(named.display_name),
             labels: self.labels,
             origin: origin.map_err(|error| error.under("origin"))?,
+            history: self.history.map(HistorySettings::to_domain).transpose()?,
             id: named.id,
         })
     }
@@ -71,6 +75,8 @@ struct SiteChange {
     labels: Option<BTreeMap<String, Option<String>>>,
     /// New origin; null is that of the first camera's model. Tracks start again in the new plane.
     origin: Option<Position>,
+    /// New settings of the history; null keeps no more tracks. What is kept already stays until it is deleted or too old.
+    history: Option<HistorySettings>,
 }
 
 /// The change that a merge patch makes of a stored site.
@@ -93,6 +99,9 @@ struct Site {
     /// Origin of the plane in which targets are tracked, if stated.
     #[serde(skip_serializing_if = "Option::is_none")]
     origin: Option<Position>,
+    /// How finished world tracks are kept; missing if none are.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    history: Option<HistorySettings>,
     /// Number of cameras whose profile names the site; `GET /v1/cameras?site=` lists them.
     cameras: u32,
     /// Counts the changes of the site, from 1.
@@ -113,6 +122,7 @@ impl From<domain::Site> for Site {
             display_name: profile.display_name,
             labels: profile.labels,
             origin: profile.origin.map(Into::into),
+            history: profile.history.map(Into::into),
             cameras,
             revision: revision.0,
             created_at,

@@ -9,8 +9,6 @@ use axum::response::IntoResponse as _;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::{StreamExt as _, stream};
 use hyper::Uri;
-use hyper::header::CONTENT_TYPE;
-use hyper::http::HeaderValue;
 use jiff::Timestamp;
 use serde::Serialize;
 use utoipa::openapi::schema::{AnyOfBuilder, Schema};
@@ -21,20 +19,19 @@ use utoipa_axum::routes;
 
 use super::cameras::CameraMoved;
 use super::fusions::{FusionRequest, observations};
-use super::moving_features::MovingFeatures;
 use crate::app::{
-    Acknowledgement, CameraEvent, EventId, ItemResult, LostEvents, NotStoredReason, TargetUpdate, TrackPoint,
-    UnplacedBox,
+    Acknowledgement, CameraEvent, EventId, ItemResult, LiveStream, LostEvents, NotStoredReason, TargetUpdate,
+    TrackPoint, UnplacedBox,
 };
-use crate::domain::{Error, Result, Score, TargetClass, TargetId, TrackerId};
-use crate::exchange::wire;
+use crate::domain::{self, Error, Result, Score, TargetClass, TargetId, TrackerId};
+use crate::exchange::{MovingFeature, MovingFeatures, MovingTarget, PathPoint, wire};
 use crate::fusion::track;
 use crate::geo::Position;
 use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::extract::{CameraPath, Client, JsonBody, LastEventId, Params, TargetPath};
 use crate::http::plumbing::problem::{ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
-use crate::http::plumbing::wire::{Durability, json, json_of_about};
+use crate::http::plumbing::wire::{Durability, geojson, json_of_about};
 
 /// Interval of the keep-alive comments of a silent event stream.
 pub(super) const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -120,6 +117,9 @@ impl From<&track::Rejection> for Rejection {
 struct TrackState {
     /// The target's id.
     target_id: String,
+    /// The receiver that the target carries, where only its tracker's id is known and it was matched.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    receiver_match: Option<ReceiverMatch>,
     /// The latest instant measured.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
@@ -150,6 +150,7 @@ impl From<&TrackPoint> for TrackState {
         let state = &point.state;
         Self {
             target_id: point.target_id.as_str().to_owned(),
+            receiver_match: point.receiver_match.as_ref().map(Into::into),
             time: state.time,
             velocity_east_m_s: state.velocity.east_m_s,
             velocity_north_m_s: state.velocity.north_m_s,
@@ -233,11 +234,9 @@ impl ToSchema for TracksOrHistories {
     }
 }
 
-fn geojson(points: &[Arc<TrackPoint>]) -> Result<axum::response::Response> {
+fn track_features(points: &[Arc<TrackPoint>]) -> Result<axum::response::Response> {
     let features = points.iter().map(|point| point.as_ref().into()).collect();
-    let mut response = json(&TrackFeatures { r#type: "FeatureCollection", features })?;
-    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/geo+json"));
-    Ok(response)
+    geojson(&TrackFeatures { r#type: "FeatureCollection", features })
 }
 
 /// The format of a history.
@@ -267,9 +266,18 @@ impl HistoryForm {
 fn moving_features<'a>(
     histories: impl Iterator<Item = &'a [Arc<TrackPoint>]>,
 ) -> Result<axum::response::Response> {
-    let mut response = json(&MovingFeatures::of(histories))?;
-    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/geo+json"));
-    Ok(response)
+    geojson(&MovingFeatures::of(histories.filter_map(moving_feature)))
+}
+
+fn moving_feature(history: &[Arc<TrackPoint>]) -> Option<MovingFeature> {
+    let target_id = history.last()?.target_id.to_string();
+    let points = history.iter().map(|point| PathPoint {
+        time: point.state.time,
+        position: point.position,
+        r95_m: point.state.r95_m,
+    });
+    let target = MovingTarget { target_id: Some(target_id.clone()), ..MovingTarget::default() };
+    MovingFeature::new(target_id, target, &points.collect::<Vec<_>>())
 }
 
 /// All that a track states, as the properties of a GeoJSON feature.
@@ -291,9 +299,9 @@ pub(super) fn track_properties(point: &TrackPoint) -> impl Serialize + use<> {
 )]
 async fn list_tracks(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri: Uri) -> ApiResult {
     if HistoryForm::of(&uri)? == HistoryForm::GeoJson {
-        return Ok(geojson(&app.tracks(&id).await?)?);
+        return Ok(track_features(&app.live().tracks(&id).await?)?);
     }
-    let histories = app.track_histories(&id).await?;
+    let histories = app.live().track_histories(&id).await?;
     Ok(moving_features(histories.iter().map(Vec::as_slice))?)
 }
 
@@ -308,9 +316,9 @@ async fn list_tracks(CallerApp(app): CallerApp, CameraPath(id): CameraPath, uri:
 )]
 async fn get_track(CallerApp(app): CallerApp, TargetPath(id, target): TargetPath, uri: Uri) -> ApiResult {
     let form = HistoryForm::of(&uri)?;
-    let history = app.track_history(&id, &target).await?;
+    let history = app.live().track_history(&id, &target).await?;
     Ok(match form {
-        HistoryForm::GeoJson => geojson(&history)?,
+        HistoryForm::GeoJson => track_features(&history)?,
         HistoryForm::MovingFeatures => moving_features(std::iter::once(&history[..]))?,
     })
 }
@@ -334,11 +342,17 @@ struct FollowedObservation<'a> {
 
 /// The receiver that the target of a box carries.
 #[derive(Serialize, ToSchema)]
-struct ReceiverMatch {
+pub(super) struct ReceiverMatch {
     /// The receiver: the target of its fixes.
     receiver_id: String,
     /// Posterior probability, 0 to 1.
     probability: f64,
+}
+
+impl From<&domain::ReceiverMatch> for ReceiverMatch {
+    fn from(own: &domain::ReceiverMatch) -> Self {
+        Self { receiver_id: own.receiver_id.as_str().to_owned(), probability: own.probability }
+    }
 }
 
 impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
@@ -347,10 +361,7 @@ impl<'a> From<&'a ItemResult> for FollowedObservation<'a> {
             fused: followed.fused.as_ref().map(Into::into),
             track: followed.track.as_ref().map(|point| point.as_ref().into()),
             world_track_id: followed.world_track.map(|id| id.to_string()),
-            receiver_match: followed.receiver_match.as_ref().map(|own| ReceiverMatch {
-                receiver_id: own.receiver_id.as_str().to_owned(),
-                probability: own.probability,
-            }),
+            receiver_match: followed.receiver_match.as_ref().map(Into::into),
         }
     }
 }
@@ -490,16 +501,16 @@ async fn follow(
     let stores_samples = params.flag("store_samples")?.unwrap_or(false);
     let durability = params.durability()?;
     params.end()?;
-    let (camera, lease) = app.own_camera(&id).await?;
+    let (camera, lease) = app.nodes().own_camera(&id).await?;
     // Times ahead of the clock are refused before any track has changed.
-    let observations = observations(&app, &body.read()?, &app.live_rules(&camera), &camera.receivers)?;
-    app.check_batch(observations.len())?;
+    let observations = observations(&app, &body.read()?, &app.live().rules(&camera), &camera.receivers)?;
+    app.limits.check_batch(observations.len())?;
     let (followed, stored) = if stores_samples {
         let (followed, acknowledgement) =
-            app.follow_and_store(&camera, observations, client, durability).await?;
+            LiveStream::follow_and_store(&app, &camera, observations, client, durability).await?;
         (followed, Some(StoredObservations::from(acknowledgement)))
     } else {
-        let follow = |observation| app.follow((&camera, &lease), observation);
+        let follow = |observation| app.live().follow((&camera, &lease), observation);
         (observations.into_iter().map(follow).collect::<Result<Vec<_>>>()?, None)
     };
     let items = followed.iter().map(Into::into).collect();
@@ -550,7 +561,7 @@ async fn watch_camera(
     let lease = app.quotas.event_streams.try_acquire(client, 1)?;
     // A text that is no id of ours names no known event.
     let last_seen = last_seen.map(|text| text.parse().unwrap_or(EventId::UNKNOWN));
-    let events = app.camera_events(&id, last_seen).await?;
+    let events = app.live().camera_events(&id, last_seen).await?;
     let shutdown = rest.shutdown.clone();
     let sent = stream::unfold(events, |mut events| async move {
         let (id, event) = match events.next().await? {

@@ -8,8 +8,6 @@ use axum::extract::State;
 use axum::response::IntoResponse as _;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::{StreamExt as _, stream};
-use hyper::header::CONTENT_TYPE;
-use hyper::http::HeaderValue;
 use hyper::{HeaderMap, Uri};
 use jiff::Timestamp;
 use serde::Serialize;
@@ -17,7 +15,7 @@ use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::tracks::{KEEP_ALIVE, PointGeometry, event_of};
+use super::tracks::{KEEP_ALIVE, PointGeometry, ReceiverMatch, event_of};
 use crate::app::{LostSiteEvents, SiteEventKind, StoredSiteEvent, WorldTrackPoint};
 use crate::domain::{Error, LiveId, Result, TargetId};
 use crate::exchange::wire::{Motion, PlaneCovariance, Position};
@@ -25,7 +23,7 @@ use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::extract::{Client, Params, SitePath, WorldTrackPath, negotiate};
 use crate::http::plumbing::problem::{ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
-use crate::http::plumbing::wire::json;
+use crate::http::plumbing::wire::{GEOJSON, geojson, json};
 
 /// Header and query parameter that name the event to continue after.
 const LAST_EVENT_HEADER: &str = "last-event-id";
@@ -59,9 +57,12 @@ struct WorldTrackState {
     /// The track's id. It is never used again, also not after a start of the server.
     #[schema(example = "3f9a02c1-17")]
     id: String,
-    /// The target, once one of its receivers is known.
+    /// The target, once one of its receivers is known: by its name, or by `receiver_match`.
     #[serde(skip_serializing_if = "Option::is_none")]
     target_id: Option<String>,
+    /// The receiver that the target carries, where it was found by association. The track's id stays the same whatever it is.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    receiver_match: Option<ReceiverMatch>,
     /// The latest instant measured.
     #[schema(value_type = String, format = DateTime)]
     time: Timestamp,
@@ -87,6 +88,7 @@ impl From<&WorldTrackPoint> for WorldTrackState {
         Self {
             id: point.id.to_string(),
             target_id: point.target_id.as_ref().map(TargetId::to_string),
+            receiver_match: point.receiver_match.as_ref().map(Into::into),
             time: point.time,
             started_at: point.started_at,
             velocity_east_m_s: point.velocity.east_m_s,
@@ -168,7 +170,6 @@ enum Form {
 
 /// The points in the form that the client accepts.
 fn answer(headers: &HeaderMap, points: &[Arc<WorldTrackPoint>], last_event: Option<LiveId>) -> ApiResult {
-    const GEOJSON: &str = "application/geo+json";
     let response = match negotiate(headers, &[("application/json", Form::Json), (GEOJSON, Form::GeoJson)])? {
         Form::Json => json(&WorldTracks {
             items: points.iter().map(|point| point.as_ref().into()).collect(),
@@ -176,9 +177,7 @@ fn answer(headers: &HeaderMap, points: &[Arc<WorldTrackPoint>], last_event: Opti
         })?,
         Form::GeoJson => {
             let features = points.iter().map(|point| point.as_ref().into()).collect();
-            let mut response = json(&WorldTrackFeatures { r#type: "FeatureCollection", features })?;
-            response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(GEOJSON));
-            response
+            geojson(&WorldTrackFeatures { r#type: "FeatureCollection", features })?
         }
     };
     Ok(response)
@@ -199,7 +198,7 @@ async fn list_world_tracks(
     SitePath(id): SitePath,
     headers: HeaderMap,
 ) -> ApiResult {
-    let tracks = app.world_tracks(&id).await?;
+    let tracks = app.world_tracks().latest(&id).await?;
     answer(&headers, &tracks.points, Some(tracks.last_event))
 }
 
@@ -224,7 +223,7 @@ async fn get_world_track(
     WorldTrackPath(id, track): WorldTrackPath,
     headers: HeaderMap,
 ) -> ApiResult {
-    answer(&headers, &app.world_track_history(&id, track).await?, None)
+    answer(&headers, &app.world_tracks().history(&id, track).await?, None)
 }
 
 /// The contents of an event besides a position.
@@ -311,7 +310,7 @@ async fn watch_site(
 ) -> ApiResult {
     let after = last_event(&headers, &uri)?;
     let lease = app.quotas.event_streams.try_acquire(client, 1)?;
-    let events = app.site_events(&id, after).await?;
+    let events = app.world_tracks().events(&id, after).await?;
     let shutdown = rest.shutdown.clone();
     let sent = stream::unfold(events, |mut events| async move {
         let event = match events.next().await? {

@@ -14,6 +14,9 @@ pub(super) struct LiveMetrics {
     pub(super) item_errors: Counter,
     pub(super) answers_lost: Counter,
     pub(super) cameras_moved: Counter,
+    pub(super) place_measurements_dropped: Counter,
+    pub(super) place_messages_dropped: Counter,
+    pub(super) finished_tracks_dropped: Counter,
 }
 
 #[derive(Clone)]
@@ -90,6 +93,21 @@ impl LiveMetrics {
             cameras_moved: registry.counter(
                 "sightfix_cameras_moved_total",
                 "Alarms that a camera was moved",
+                &[],
+            ),
+            finished_tracks_dropped: registry.counter(
+                "sightfix_finished_tracks_dropped_total",
+                "Finished tracks that the history does not have, for too many waited for the archive",
+                &[],
+            ),
+            place_measurements_dropped: registry.counter(
+                "sightfix_place_measurements_dropped_total",
+                "Measurements of tracks that were not compared with places, for too many waited",
+                &[],
+            ),
+            place_messages_dropped: registry.counter(
+                "sightfix_place_messages_dropped_total",
+                "Messages of place events that no sink delivers, for too many waited in its outbox",
                 &[],
             ),
         }

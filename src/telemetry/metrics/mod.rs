@@ -218,6 +218,21 @@ impl Metrics {
         }
     }
 
+    /// A measurement could not be compared with places, for too many waited.
+    pub fn place_measurement_dropped(&self) {
+        self.live.place_measurements_dropped.increment(1);
+    }
+
+    /// Messages of place events were dropped, for too many waited in the outbox of a sink.
+    pub fn place_messages_dropped(&self, count: u64) {
+        self.live.place_messages_dropped.increment(count);
+    }
+
+    /// A finished track could not be kept, for too many waited for the archive.
+    pub fn finished_track_dropped(&self) {
+        self.live.finished_tracks_dropped.increment(1);
+    }
+
     /// A world track was confirmed.
     pub fn world_track_started(&self) {
         self.sites.tracks_started.increment(1);

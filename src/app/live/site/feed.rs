@@ -3,14 +3,15 @@
 use tokio::sync::mpsc;
 
 use super::item::{ItemSource, SiteItem};
+use super::places::SitePlaces;
 use super::task;
-use crate::app::App;
+use crate::app::live::Live;
 use crate::app::registry::ActiveCamera;
-use crate::domain::{LiveId, Observation};
+use crate::domain::{LiveId, Observation, SiteId};
 use crate::fusion::observed::ObservedPositions;
 use crate::telemetry::SiteItemOutcome;
 
-impl App {
+impl Live<'_> {
     /// Hands what an observation measured to the tracker of its camera's site, and returns the world track of
     /// its target as of the latest frame. A full queue drops it, counted.
     pub(in crate::app::live) fn feed_site(
@@ -19,10 +20,11 @@ impl App {
         observation: &Observation,
         observed: &ObservedPositions<'_>,
     ) -> Option<LiveId> {
-        let site = self.site_registry.get(camera.site.as_ref()?)?;
+        let id = camera.site.as_ref()?;
+        let site = self.site_registry.get(id)?;
         let queue = site.live.queue.get_or_init(|| {
             let (sender, receiver) = mpsc::channel(self.limits.site_queue.max(1));
-            let task = task::run(site.live.clone(), receiver, self.site_resources());
+            let task = task::run(site.live.clone(), receiver, self.site_resources(id));
             self.tasks.spawn(task);
             sender
         });
@@ -34,11 +36,14 @@ impl App {
         site.live.track_of(&camera.id, &observation.tracked_as()?)
     }
 
-    fn site_resources(&self) -> task::SiteResources {
+    fn site_resources(&self, id: &SiteId) -> task::SiteResources {
         task::SiteResources {
+            places: SitePlaces { site: id.clone(), monitor: self.places.clone() },
             clock: self.clock.clone(),
             limits: self.limits.clone(),
             metrics: self.metrics.clone(),
+            history: self.archived_history.queue().clone(),
+            matching_slot: self.matching_slot.clone(),
         }
     }
 }
@@ -55,6 +60,7 @@ fn items_of<'a>(
         time: observation.time(),
         target_id: observation.target_id().cloned(),
         tracked_as: observation.tracked_as(),
+        class: observation.class().cloned(),
         position,
         source,
     };

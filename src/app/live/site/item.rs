@@ -2,7 +2,7 @@
 
 use jiff::Timestamp;
 
-use crate::domain::{CameraId, TargetId};
+use crate::domain::{CameraId, TargetClass, TargetId};
 use crate::geo::{PlaneCovariance, Position};
 use crate::model::JointError;
 
@@ -15,6 +15,8 @@ pub(super) struct SiteItem {
     pub(super) target_id: Option<TargetId>,
     /// The name under which the camera's tracker follows the target.
     pub(super) tracked_as: Option<TargetId>,
+    /// Class reported by the detector.
+    pub(super) class: Option<TargetClass>,
     pub(super) position: Position,
     pub(super) source: ItemSource,
 }

@@ -6,8 +6,10 @@
 mod events;
 mod feed;
 mod item;
+mod places;
 mod published;
 mod reader;
+mod rounds;
 pub(in crate::app) mod state;
 mod task;
 mod tracker;
@@ -16,8 +18,11 @@ use std::sync::Arc;
 
 use super::sync::lock;
 use crate::app::App;
-use crate::app::site_registry::ActiveSite;
+use crate::app::cluster::Nodes;
+use crate::app::site_registry::{ActiveSite, SiteRegistry};
 use crate::domain::{Error, ErrorKind, LiveId, Result, SiteId};
+use crate::store::Store;
+use crate::telemetry::Metrics;
 
 pub use events::{SiteEvent, SiteEventKind};
 pub use published::{WorldSighting, WorldTrackPoint};
@@ -32,12 +37,34 @@ pub struct SiteTracks {
     pub last_event: LiveId,
 }
 
+/// The world tracks of sites, for readers.
+#[derive(Clone, Copy)]
+pub struct WorldTracks<'a> {
+    store: &'a Store,
+    site_registry: &'a SiteRegistry,
+    nodes: Nodes<'a>,
+    metrics: &'a Metrics,
+}
+
 impl App {
+    /// The world tracks of sites, for readers.
+    #[must_use]
+    pub fn world_tracks(&self) -> WorldTracks<'_> {
+        WorldTracks {
+            store: &self.store,
+            site_registry: &self.site_registry,
+            nodes: self.nodes(),
+            metrics: &self.metrics,
+        }
+    }
+}
+
+impl WorldTracks<'_> {
     /// Where every target of a site is now.
     ///
     /// # Errors
     /// `SiteNotFound`, `CameraOnOtherNode`, `CameraBetweenNodes`.
-    pub async fn world_tracks(&self, id: &SiteId) -> Result<SiteTracks> {
+    pub async fn latest(&self, id: &SiteId) -> Result<SiteTracks> {
         let live = &self.readable_site(id).await?.live;
         // The event first: what is published in between is in both.
         let last_event = live.id_of(live.events.latest());
@@ -47,8 +74,8 @@ impl App {
     /// Where a target was, oldest first, as far back as the history reaches.
     ///
     /// # Errors
-    /// As [`App::world_tracks`]; `TrackNotFound` if the track has ended.
-    pub async fn world_track_history(&self, id: &SiteId, track: LiveId) -> Result<Vec<Arc<WorldTrackPoint>>> {
+    /// As [`WorldTracks::latest`]; `TrackNotFound` if the track has ended.
+    pub async fn history(&self, id: &SiteId, track: LiveId) -> Result<Vec<Arc<WorldTrackPoint>>> {
         let site = self.readable_site(id).await?;
         let history = lock(&site.live.tracks).history(track);
         history.ok_or_else(|| {
@@ -60,17 +87,17 @@ impl App {
     /// The events of a site: after an event, or from now on.
     ///
     /// # Errors
-    /// As [`App::world_tracks`].
-    pub async fn site_events(&self, id: &SiteId, after: Option<LiveId>) -> Result<SiteEvents> {
+    /// As [`WorldTracks::latest`].
+    pub async fn events(&self, id: &SiteId, after: Option<LiveId>) -> Result<SiteEvents> {
         let site = self.readable_site(id).await?;
-        let watch = self.watch_site_owner(site.key);
+        let watch = self.nodes.watch_site_owner(site.key);
         Ok(SiteEvents::new(site.live.clone(), after, watch, self.metrics.clone()))
     }
 
     /// A site whose live state is read.
-    async fn readable_site(&self, id: &SiteId) -> Result<Arc<ActiveSite>> {
+    pub(in crate::app) async fn readable_site(&self, id: &SiteId) -> Result<Arc<ActiveSite>> {
         let site = self.active_site(id).await?;
-        self.check_site_readable(id, site.key).await?;
+        self.nodes.check_site_readable(id, site.key).await?;
         // Its live state may be a new one.
         self.active_site(id).await
     }
@@ -79,7 +106,7 @@ impl App {
     async fn active_site(&self, id: &SiteId) -> Result<Arc<ActiveSite>> {
         match self.site_registry.get(id) {
             Some(site) => Ok(site),
-            None => self.site_registry.refresh_site(&self.store, id).await,
+            None => self.site_registry.refresh_site(self.store, id).await,
         }
     }
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use jiff::{SignedDuration, Timestamp};
 
 use crate::app::live::history::History;
-use crate::domain::{CameraId, LiveId, Motion, TargetId, Velocity};
+use crate::domain::{CameraId, LiveId, Motion, ReceiverId, ReceiverMatch, TargetId, Velocity};
 use crate::geo::{PlaneCovariance, Position};
 
 /// A camera is taken to see a target until this long after its latest detection.
@@ -16,8 +16,10 @@ const SEEN_FOR: SignedDuration = SignedDuration::from_secs(1);
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorldTrackPoint {
     pub id: LiveId,
-    /// The target, once one of its receivers is known.
+    /// The target, once one of its receivers is known: by its name, or by `receiver_match`.
     pub target_id: Option<TargetId>,
+    /// The receiver that the target carries, where it was found by association.
+    pub receiver_match: Option<ReceiverMatch>,
     /// The instant of the latest measurement.
     pub time: Timestamp,
     /// Time of the first measurement.
@@ -29,6 +31,8 @@ pub struct WorldTrackPoint {
     pub motion: Motion,
     /// Covariance of the position's error, m2.
     pub covariance_m2: PlaneCovariance,
+    /// Covariance of the velocity's error, m2/s2.
+    pub velocity_covariance_m2_s2: PlaneCovariance,
     /// The cameras that see the target at the instant.
     pub sightings: Vec<WorldSighting>,
 }
@@ -76,7 +80,7 @@ pub(super) struct PublishedTracks {
 impl PublishedTracks {
     /// Publishes the latest point of a track.
     pub(super) fn publish(&mut self, point: &Arc<WorldTrackPoint>, most_points: usize) {
-        let previous = self.tracks.get(&point.id).and_then(History::latest).cloned();
+        let previous = self.latest_of(point.id).cloned();
         if let Some(previous) = previous {
             self.forget_tracker_ids(&previous);
         }
@@ -112,6 +116,17 @@ impl PublishedTracks {
         self.by_tracker_id.get(camera)?.get(tracker_id).copied()
     }
 
+    /// True if a track is matched with the receiver.
+    pub(super) fn carries(&self, receiver_id: &ReceiverId) -> bool {
+        let matches = self.tracks.values().filter_map(|own| own.latest()?.receiver_match.as_ref());
+        matches.into_iter().any(|own| own.receiver_id == *receiver_id)
+    }
+
+    /// The latest point of a track.
+    pub(super) fn latest_of(&self, id: LiveId) -> Option<&Arc<WorldTrackPoint>> {
+        self.tracks.get(&id).and_then(History::latest)
+    }
+
     pub(super) fn latest(&self) -> Vec<Arc<WorldTrackPoint>> {
         let mut points: Vec<_> =
             self.tracks.values().filter_map(|history| history.latest().cloned()).collect();
@@ -138,12 +153,14 @@ mod tests {
         Arc::new(WorldTrackPoint {
             id: LiveId { epoch: 1, number },
             target_id: None,
+            receiver_match: None,
             time,
             started_at: time,
             position: Position::new(8.0, 47.0).expect("valid"),
             velocity: Velocity::default(),
             motion: Motion::of(Velocity::default(), PlaneCovariance::isotropic(1.0), 0.5),
             covariance_m2: PlaneCovariance::isotropic(1.0),
+            velocity_covariance_m2_s2: PlaneCovariance::isotropic(1.0),
             sightings: seen_as.iter().map(sighting).collect(),
         })
     }

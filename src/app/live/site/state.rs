@@ -10,7 +10,7 @@ use super::item::SiteItem;
 use super::published::PublishedTracks;
 use crate::app::live::event_log::EventLog;
 use crate::app::live::sync::lock;
-use crate::domain::{CameraId, LiveId, TargetId};
+use crate::domain::{CameraId, HistorySettings, LiveId, ReceiverId, ReceiverMatch, TargetId, TrackScope};
 use crate::geo::Position;
 
 /// Queue, tracks and events of one site.
@@ -19,6 +19,8 @@ pub(in crate::app) struct SiteLive {
     pub(super) epoch: u32,
     /// Origin of the plane, if the operator states it.
     pub(super) origin: Mutex<Option<Position>>,
+    /// The site and how its history is kept, if it has one.
+    pub(super) history: Mutex<Option<(TrackScope, HistorySettings)>>,
     /// The way to the task, which starts with the first item.
     pub(super) queue: OnceLock<mpsc::Sender<SiteItem>>,
     pub(super) tracks: Mutex<PublishedTracks>,
@@ -31,6 +33,7 @@ impl SiteLive {
         Arc::new(Self {
             epoch,
             origin: Mutex::default(),
+            history: Mutex::default(),
             queue: OnceLock::new(),
             tracks: Mutex::default(),
             events: Arc::new(EventLog::new(events)),
@@ -43,6 +46,11 @@ impl SiteLive {
         *lock(&self.origin) = origin;
     }
 
+    /// Keeps the tracks of the site that finish from now on; `None` keeps none.
+    pub(in crate::app) fn set_history(&self, history: Option<(TrackScope, HistorySettings)>) {
+        *lock(&self.history) = history;
+    }
+
     /// Ends the task and the readers of a site that is deleted, or of a server that ends.
     pub(in crate::app) fn end(&self) {
         self.ended.cancel();
@@ -50,6 +58,21 @@ impl SiteLive {
 
     pub(super) const fn id_of(&self, number: u64) -> LiveId {
         LiveId { epoch: self.epoch, number }
+    }
+
+    /// The receiver of that track.
+    pub(in crate::app::live) fn receiver_of(
+        &self,
+        camera: &CameraId,
+        target_id: &TargetId,
+    ) -> Option<ReceiverMatch> {
+        let tracks = lock(&self.tracks);
+        tracks.latest_of(tracks.track_of(camera, target_id)?)?.receiver_match.clone()
+    }
+
+    /// True if a track that cameras see carries the receiver.
+    pub(in crate::app::live) fn shows(&self, receiver_id: &ReceiverId) -> bool {
+        lock(&self.tracks).carries(receiver_id)
     }
 
     /// The world track of which a camera's tracker saw the target lately.

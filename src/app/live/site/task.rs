@@ -7,8 +7,12 @@ use tokio::sync::mpsc;
 use tokio::time::MissedTickBehavior;
 
 use super::item::SiteItem;
+use super::places::SitePlaces;
+use super::rounds::Rounds;
 use super::state::SiteLive;
 use super::tracker::SiteTracker;
+use crate::app::history::queue::HistoryQueue;
+use crate::app::live::identification::MatchingSlot;
 use crate::clock::Clock;
 use crate::config::Limits;
 use crate::telemetry::Metrics;
@@ -23,12 +27,17 @@ pub(super) struct SiteResources {
     pub(super) clock: Clock,
     pub(super) limits: Limits,
     pub(super) metrics: Metrics,
+    pub(super) places: SitePlaces,
+    pub(super) history: HistoryQueue,
+    pub(super) matching_slot: MatchingSlot,
 }
 
 /// Feeds the tracker until the site is deleted or the server ends.
 pub(super) async fn run(live: Arc<SiteLive>, mut queue: mpsc::Receiver<SiteItem>, resources: SiteResources) {
     let clock = resources.clock.clone();
-    let mut tracker = SiteTracker::new(live.clone(), resources.limits, resources.metrics);
+    let SiteResources { limits, metrics, places, history, matching_slot, .. } = resources;
+    let mut rounds = Rounds::new(matching_slot, clock.clone());
+    let mut tracker = SiteTracker::new(live.clone(), limits, metrics, Some(places), history.clone());
     let mut tick = tokio::time::interval(TICK);
     tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut items = Vec::with_capacity(BATCH);
@@ -44,8 +53,9 @@ pub(super) async fn run(live: Arc<SiteLive>, mut queue: mpsc::Receiver<SiteItem>
             tracker.push(item, now);
         }
         tracker.advance(now);
+        rounds.advance(&mut tracker, now).await;
         // Other tasks on this thread get their turn.
         tokio::task::yield_now().await;
     }
-    tracker.end();
+    history.send_all(tracker.end()).await;
 }

@@ -1,7 +1,7 @@
 //! Frames of a site's cameras through the world tracker, and what is published of it.
 
 use std::collections::hash_map::Entry;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -9,12 +9,18 @@ use jiff::{SignedDuration, Timestamp};
 
 use super::events::{SiteEvent, SiteEventKind};
 use super::item::{ItemSource, SiteItem};
+use super::places::SitePlaces;
 use super::published::{WorldSighting, WorldTrackPoint};
 use super::state::SiteLive;
+use crate::app::history::path::{FinishedTrack, RecordedState};
+use crate::app::history::queue::HistoryQueue;
+use crate::app::history::recorder::TrackRecorder;
 use crate::app::live::sync::lock;
 use crate::config::Limits;
-use crate::domain::{CameraId, LiveId, ReceiverId, RunId, TargetId};
+use crate::domain::{CameraId, LiveId, ReceiverId, RunId, TargetClass, TargetId};
+use crate::fusion::association::{LiveMatchSettings, WorldReceiverWindow, WorldReceivers};
 use crate::fusion::frame_assembler::{AssembledFrame, FrameAssembler, FrameLimits, PushOutcome};
+use crate::fusion::smoother::FilterMoments;
 use crate::fusion::world::{
     CameraFrame, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId, WorldTrackSettings,
     WorldTracker,
@@ -41,6 +47,8 @@ pub(super) struct SiteTracker {
     live: Arc<SiteLive>,
     limits: Limits,
     metrics: Metrics,
+    /// Where measured tracks are evaluated.
+    places: Option<SitePlaces>,
     frames: FrameAssembler<Source, SiteItem>,
     /// Time by which a fix may be older than the latest frame.
     fix_lateness: SignedDuration,
@@ -56,6 +64,9 @@ pub(super) struct SiteTracker {
     /// The tracks whose start was announced and whose end was not, each with the latest instant at which its
     /// position was announced.
     announced: HashMap<LiveId, Option<Timestamp>>,
+    /// Those of them that are recorded, if the site has a history.
+    recorders: HashMap<LiveId, TrackRecorder>,
+    history: HistoryQueue,
 }
 
 /// The model by which a camera's boxes were located.
@@ -85,10 +96,18 @@ struct ActiveTracker {
     tracked_at: Duration,
     /// The latest time of a frame.
     latest: Timestamp,
+    /// Positions of its tracks and fixes of its receivers, and who carries what.
+    window: WorldReceiverWindow,
 }
 
 impl SiteTracker {
-    pub(super) fn new(live: Arc<SiteLive>, limits: Limits, metrics: Metrics) -> Self {
+    pub(super) fn new(
+        live: Arc<SiteLive>,
+        limits: Limits,
+        metrics: Metrics,
+        places: Option<SitePlaces>,
+        history: HistoryQueue,
+    ) -> Self {
         let max_late_s = WorldTrackSettings::default().max_late_s;
         let fix_lateness = SignedDuration::try_from_secs_f64(max_late_s).unwrap_or_default();
         let frames = FrameAssembler::new(FrameLimits {
@@ -101,6 +120,7 @@ impl SiteTracker {
             live,
             limits,
             metrics,
+            places,
             frames,
             fix_lateness,
             active: None,
@@ -109,6 +129,8 @@ impl SiteTracker {
             cameras: HashMap::new(),
             carriers: HashMap::new(),
             announced: HashMap::new(),
+            recorders: HashMap::new(),
+            history,
         }
     }
 
@@ -190,9 +212,28 @@ impl SiteTracker {
         }
     }
 
-    /// Ends all tracks, for the site has ended.
-    pub(super) fn end(&mut self) {
+    /// What a round of matching needs, if there is anything to match.
+    pub(super) fn window(&self) -> Option<(u64, WorldReceiverWindow)> {
+        let window = self.active.as_ref().map(|active| &active.window)?;
+        window.can_be_matched().then(|| (self.number_offset, window.clone()))
+    }
+
+    /// Takes the findings of a round over, unless the tracker has started again since the round began with that offset of
+    /// its numbers.
+    pub(super) fn accept(&mut self, number_offset: u64, found: WorldReceivers) {
+        let Some(active) = self.active.as_mut().filter(|_| self.number_offset == number_offset) else {
+            return;
+        };
+        active.window.accept(found);
+        let events = active.tracker.set_receiver_matches(active.window.receivers());
+        self.announce(events);
+    }
+
+    /// Ends all tracks, for the site has ended, and returns those that were recorded.
+    pub(super) fn end(&mut self) -> Vec<FinishedTrack> {
+        let finished = self.recorders.drain().filter_map(|(_, recorder)| recorder.finish()).collect();
         self.restart();
+        finished
     }
 
     /// Starts again where the operator has moved the origin.
@@ -264,6 +305,7 @@ impl SiteTracker {
             has_trusted_plane: stated.or(model_origin).is_some(),
             tracked_at: Duration::ZERO,
             latest: first.time,
+            window: WorldReceiverWindow::new(LiveMatchSettings::of_site()),
         };
         let is_held = holds(&active);
         self.active = Some(active);
@@ -287,20 +329,25 @@ impl SiteTracker {
             let carrier = self.carriers.get(target_id).filter(|carrier| !carrier.is_outdated(now));
             carrier.is_some_and(|carrier| carrier.cameras.contains(camera))
         };
-        let mut detections = Vec::with_capacity(items.len());
+        let (mut detections, mut classes) =
+            (Vec::with_capacity(items.len()), Vec::with_capacity(items.len()));
         let settings = active.tracker.settings();
         for item in items {
             let detection = detection_of(item, &plane, settings, joint_run, carries);
             self.metrics.site_item(detection.as_ref().err().copied().unwrap_or(SiteItemOutcome::Tracked));
-            detections.extend(detection);
+            if let Ok(detection) = detection {
+                detections.push(detection);
+                classes.push(item.class.clone());
+            }
         }
         let outcome = active.tracker.observe(&CameraFrame { camera, time, detections });
+        active.window.observe(&active.tracker, &outcome);
         self.announce(outcome.events);
-        let mut measured: Vec<WorldTrackId> = outcome.tracks.into_iter().flatten().collect();
-        measured.sort_unstable();
-        measured.dedup();
-        for track in measured {
-            self.publish(track);
+        let tracked = outcome.tracks.into_iter().zip(classes);
+        let classes: BTreeMap<WorldTrackId, _> =
+            tracked.filter_map(|(track, class)| Some((track?, class))).collect();
+        for (track, class) in classes {
+            self.publish(track, class, true);
         }
     }
 
@@ -310,41 +357,85 @@ impl SiteTracker {
         let position = active.tracker.plane().to_plane(item.position);
         self.metrics.site_item(SiteItemOutcome::Tracked);
         let receiver = ReceiverId::from(target_id.clone());
+        active.window.observe_fix(&receiver, time, position, Some(variance_m2));
         let outcome = active.tracker.observe_fix(&receiver, time, position, variance_m2.sqrt());
         self.announce(outcome.events);
         if let Some(track) = outcome.track {
-            self.publish(track);
+            self.publish(track, None, false);
         }
     }
 
-    /// Publishes a track that was measured, and announces its position from time to time.
-    fn publish(&mut self, track: WorldTrackId) {
+    /// Publishes and records a track that was measured by a box, or else by a fix, and announces its position from time to
+    /// time.
+    fn publish(&mut self, track: WorldTrackId, class: Option<TargetClass>, has_box: bool) {
         let Some(active) = &self.active else { return };
         let Some(track) = active.tracker.track(track) else { return };
         let point = Arc::new(self.point_of(track, active.tracker.plane()));
+        if self.announced.contains_key(&point.id) {
+            let (velocity_covariance, moments) =
+                (track.state().velocity_covariance, track.moments(active.tracker.settings()));
+            self.record(&point, class.as_ref(), velocity_covariance, moments);
+        }
         let Some(announced_at) = self.announced.get_mut(&point.id) else { return };
         lock(&self.live.tracks).publish(&point, self.limits.track_points);
+        if let Some(places) = &self.places {
+            places.measured(&point, class, has_box);
+        }
         if announced_at.is_none_or(|last| point.time.duration_since(last).abs() >= ANNOUNCE_STEP) {
             *announced_at = Some(point.time);
             self.live.events.push(SiteEvent { time: point.time, kind: SiteEventKind::Measured(point) });
         }
     }
 
+    fn record(
+        &mut self,
+        point: &WorldTrackPoint,
+        class: Option<&TargetClass>,
+        velocity_covariance: PlaneCovariance,
+        moments: FilterMoments,
+    ) {
+        let Some((scope, settings)) = lock(&self.live.history).clone() else {
+            self.recorders.clear();
+            return;
+        };
+        let recorder = self
+            .recorders
+            .entry(point.id)
+            .or_insert_with(|| TrackRecorder::new(self.history.clone(), scope, settings));
+        recorder.push(&RecordedState {
+            track: Some(point.id.to_string()),
+            target: point.target_id.as_ref(),
+            class,
+            time: point.time,
+            position: point.position,
+            velocity: point.velocity,
+            covariance: point.covariance_m2,
+            velocity_covariance,
+            stationary_probability: point.motion.stationary_probability,
+            moments,
+            is_restarted: false,
+        });
+    }
+
     fn point_of(&self, track: &WorldTrack, plane: &LocalPlane) -> WorldTrackPoint {
         let state = track.state();
+        let matched = track.receiver_match().map(|own| &own.receiver_id);
+        let receiver = track.receiver().or(matched);
         let current = track
             .sightings()
             .iter()
             .filter(|sighting| WorldSighting::is_current(sighting.last_seen, track.last_seen()));
         WorldTrackPoint {
             id: self.id_of(track.id()),
-            target_id: track.receiver().cloned().map(TargetId::from),
+            target_id: receiver.cloned().map(TargetId::from),
+            receiver_match: track.receiver_match().cloned(),
             time: track.last_seen(),
             started_at: track.born(),
             position: plane.to_position(state.position),
             velocity: state.velocity,
             motion: state.motion(),
             covariance_m2: state.covariance_m2,
+            velocity_covariance_m2_s2: state.velocity_covariance,
             sightings: current
                 .map(|sighting| WorldSighting {
                     camera_id: sighting.camera.clone(),
@@ -381,6 +472,9 @@ impl SiteTracker {
                 }
                 WorldEvent::Merged { track, ended } => {
                     let (track, ended) = (self.id_of(track), self.id_of(ended));
+                    if let Some(places) = &self.places {
+                        places.merged(track, ended);
+                    }
                     if self.announced.contains_key(&ended) {
                         // A tentative track that merges a confirmed one becomes confirmed.
                         self.announce_start(track, time);
@@ -410,6 +504,7 @@ impl SiteTracker {
 
     /// Nobody knows of a track that was never announced.
     fn announce_end(&mut self, track: LiveId, time: Timestamp, kind: SiteEventKind) {
+        self.recorders.remove(&track);
         if self.announced.remove(&track).is_some() {
             lock(&self.live.tracks).remove(track);
             self.metrics.world_track_ended();
@@ -462,6 +557,7 @@ fn detection_of(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::app::history::queue::ArchivedHistory;
     use crate::geo::Position;
 
     const START_S: i64 = 1_800_000_000;
@@ -476,7 +572,13 @@ mod tests {
     impl Site {
         fn new() -> Self {
             let live = SiteLive::new(1, 100);
-            let tracker = SiteTracker::new(live.clone(), Limits::default(), Metrics::new());
+            let tracker = SiteTracker::new(
+                live.clone(),
+                Limits::default(),
+                Metrics::new(),
+                None,
+                ArchivedHistory::new(&Limits::default(), Metrics::new()).0.queue().clone(),
+            );
             Self { live, tracker, now: Duration::ZERO, box_variance_m2: 0.25 }
         }
 
@@ -489,6 +591,7 @@ mod tests {
                 time: Timestamp::from_millisecond(1_000 * START_S + ms).expect("in range"),
                 target_id: Some(TargetId::new(tracker_id).expect("a name")),
                 tracked_as: Some(TargetId::new(tracker_id).expect("a name")),
+                class: None,
                 position: origin,
                 source: ItemSource::Box {
                     covariance_m2: PlaneCovariance::isotropic(self.box_variance_m2),
@@ -553,6 +656,7 @@ mod tests {
             time: Timestamp::from_second(START_S).expect("in range"),
             target_id: Some(TargetId::new("walker").expect("a name")),
             tracked_as: None,
+            class: None,
             position: Position::new(8.0, 47.0).expect("valid"),
             source: ItemSource::Fix { variance_m2: 4.0 },
         };

@@ -15,12 +15,12 @@ use tokio::net::TcpStream;
 use tokio::time::Instant;
 
 use super::ais::{ShipState, position_report};
-use super::places::{PERIOD_S, Report};
+use super::scenes::{PERIOD_S, Report};
 use crate::domain::{ConnectionId, ReceiverId};
 use crate::geo::Position;
 
 /// Pause after a failure, in which the message is lost, as those of a real device are.
-const PAUSE: Duration = Duration::from_secs(1);
+pub(super) const PAUSE: Duration = Duration::from_secs(1);
 
 /// The source that devices report to.
 pub(super) struct Source {

@@ -1,13 +1,15 @@
 //! The demonstration: a simulated harbour whose cameras are created and trained like real ones. Its cameras, phones and
-//! ship then send through the server's own port, in real time, until somebody ends it.
+//! ship then send through the server's own port, in real time, and a display receives its events, until somebody ends it.
 
 mod ais;
 mod device;
+mod display;
 mod places;
+mod scenes;
 
 use std::collections::BTreeMap;
 use std::io::Write as _;
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, SocketAddr};
 use std::num::NonZeroU64;
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,20 +18,23 @@ use anyhow::Context as _;
 use futures_util::StreamExt as _;
 use futures_util::future::{BoxFuture, join_all};
 use jiff::{SignedDuration, Timestamp};
-use serde_json::json;
+use serde_json::{Value, json};
+use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
 use self::device::{Source, phone_message, report_forever, ship_message};
-use self::places::{
-    Identities, PERIOD_S, Place, items, phone_reports, ramp, samples, ship_reports, square, training_site,
+use self::display::receive_forever;
+use self::scenes::{
+    Identities, PERIOD_S, Scene, items, phone_reports, ramp, samples, ship_reports, square, training_site,
     yard,
 };
 use crate::app::{App, ConnectionRequest, DemonstrationParts, RunRequest};
 use crate::cli::progress::Progress;
+use crate::clock::Clock;
 use crate::doctor::reachable;
 use crate::domain::{
-    CameraId, ConnectionId, Durability, GnssError, JobState, LiveItem, NewCamera, NewSite, Picture,
-    PictureFormat, Recipe, RunId, SampleFilter, SigmaM, SiteId, StoredSample,
+    CameraId, ConnectionId, Durability, ErrorKind, GnssError, JobState, LiveItem, NewCamera, NewSite,
+    Picture, PictureFormat, PlaceId, Recipe, RunId, SampleFilter, SigmaM, SiteId, StoredSample, TrackScope,
 };
 use crate::exchange::ConnectionDraft;
 use crate::replay::{Counters, FaultShares, Pace, RecordedStream, ReplayOptions, replay};
@@ -40,21 +45,31 @@ const CAMERA: &str = "demo";
 const SITE: &str = "demo-square";
 const PHONES: &str = "demo-phones";
 const SHIP: &str = "demo-ship";
+const DISPLAY: &str = "demo-display";
 
 /// Time that the ramp has recorded when the demonstration begins, so that it learns within the next minute.
 const RECORDED: Duration = Duration::from_secs(420);
 
-fn places() -> [Place; 3] {
+fn scenes() -> [Scene; 3] {
     [square(), yard(), ramp()]
 }
 
-/// Fills the data folder if it is empty, trains the cameras, and prints requests to try.
-pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
+/// Fills the data folder if it is empty, lets targets move if `moves`, trains the cameras, and prints requests to try.
+pub(super) async fn show(app: &App, address: SocketAddr, moves: bool) -> anyhow::Result<()> {
     if app.cameras().list(None, None, 1).await?.items.is_empty() {
         create(app).await?;
     }
     let id = CameraId::new(CAMERA)?;
     app.cameras().get(&id).await.context("the data folder holds other cameras; choose an empty one")?;
+    if moves {
+        // Targets with a fix move before the first camera is trained.
+        let app = app.clone();
+        tokio::spawn(async move {
+            if let Err(error) = run(&app, address, Clock::system().now()).await {
+                tracing::error!(%error, "the targets of the demonstration do not move");
+            }
+        });
+    }
     train(app).await?;
     let samples = app.samples().list(&id, &SampleFilter::default(), None, 1).await?.items;
     let sample = samples.into_iter().next().context("the camera of the demonstration has no sample")?;
@@ -67,17 +82,17 @@ pub(super) async fn show(app: &App, address: SocketAddr) -> anyhow::Result<()> {
 async fn create(app: &App) -> anyhow::Result<()> {
     let site = SiteId::new(SITE)?;
     app.sites().create(NewSite { display_name: "Square".to_owned(), ..NewSite::named(site.clone()) }).await?;
-    for place in places() {
-        let is_square = place.identities == Identities::Phones;
-        let seen = training_site(&place);
-        let pictures = site_stills(&place.options);
-        for (((id, name), samples), picture) in place.cameras.iter().zip(samples(&seen)).zip(pictures) {
+    for scene in scenes() {
+        let is_square = scene.identities == Identities::Phones;
+        let seen = training_site(&scene);
+        let pictures = site_stills(&scene.options);
+        for (((id, name), samples), picture) in scene.cameras.iter().zip(samples(&seen)).zip(pictures) {
             let id = CameraId::new(id)?;
             let camera = NewCamera {
                 display_name: (*name).to_owned(),
                 image_size: Some(seen.image_size),
-                gnss_error: GnssError::Known(SigmaM::new(place.options.gnss_sigma_m)?),
-                location: Some(place.options.origin),
+                gnss_error: GnssError::Known(SigmaM::new(scene.options.gnss_sigma_m)?),
+                location: Some(scene.options.origin),
                 recipe: Recipe::Projective,
                 labels: BTreeMap::from([("demonstration".to_owned(), "simulated".to_owned())]),
                 retrain_when_moved: true,
@@ -85,11 +100,14 @@ async fn create(app: &App) -> anyhow::Result<()> {
                 ..NewCamera::named(id.clone())
             };
             app.cameras().create(camera).await?;
-            app.set_picture(&id, Some(&Picture::new(PictureFormat::Png, png_file(&picture)?)?)).await?;
-            if place.is_trained {
+            app.pictures().set(&id, Some(&Picture::new(PictureFormat::Png, png_file(&picture)?)?)).await?;
+            if scene.is_trained {
                 app.store.insert_samples(&id, samples, Durability::Synced).await?;
             }
         }
+    }
+    for (id, settings) in places::of_square(&square().options) {
+        app.places().create(PlaceId::new(id)?, TrackScope::Site(site.clone()), &settings).await?;
     }
     let of_square: Vec<&str> = square().cameras.iter().map(|(id, _)| *id).collect();
     create_source(app, PHONES, "Phones", "phone", &of_square).await?;
@@ -105,9 +123,12 @@ async fn create_source(
     camera_ids: &[&str],
 ) -> anyhow::Result<()> {
     let source = json!({ "address": "push:", "format": format, "camera_ids": camera_ids });
-    let draft: ConnectionDraft =
-        serde_json::from_value(json!({ "id": id, "display_name": display_name, "source": source }))?;
-    app.create_connection(ConnectionRequest::try_from(draft)?).await?;
+    create_connection(app, json!({ "id": id, "display_name": display_name, "source": source })).await
+}
+
+async fn create_connection(app: &App, draft: Value) -> anyhow::Result<()> {
+    let draft: ConnectionDraft = serde_json::from_value(draft)?;
+    app.connections().create(ConnectionRequest::try_from(draft)?).await?;
     Ok(())
 }
 
@@ -124,7 +145,7 @@ fn png_file(still: &Still) -> anyhow::Result<Vec<u8>> {
 /// Trains the cameras that have no model yet, and do not learn by themselves.
 async fn train(app: &App) -> anyhow::Result<()> {
     let mut runs = Vec::new();
-    for (id, _) in places().iter().filter(|place| place.is_trained).flat_map(|place| place.cameras) {
+    for (id, _) in scenes().iter().filter(|scene| scene.is_trained).flat_map(|scene| scene.cameras) {
         let id = CameraId::new(id)?;
         if app.cameras().get(&id).await?.active_model.is_none() {
             let run = app.training().start(&id, RunRequest::default(), None).await?.id;
@@ -154,31 +175,45 @@ async fn trained(app: &App, id: &CameraId, run: RunId) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Creates the sink of the display, which listens at another port each time.
+async fn create_display(app: &App, address: SocketAddr) -> anyhow::Result<()> {
+    let id = ConnectionId::new(DISPLAY)?;
+    if let Err(error) = app.connections().delete(&id, None).await {
+        anyhow::ensure!(error.kind() == ErrorKind::ConnectionNotFound, error);
+    }
+    let sink =
+        json!({ "address": format!("http://{address}"), "content": "place_events", "site_ids": [SITE] });
+    create_connection(app, json!({ "id": DISPLAY, "display_name": "Display at the quay", "sink": sink }))
+        .await
+}
+
 /// Sends what cameras, phones and ship of the simulation measure, in real time, until the demonstration is ended.
 ///
 /// # Errors
-/// A recording that is empty, or an address that is none.
-pub(super) async fn run(app: &App, address: SocketAddr, now: Timestamp) -> anyhow::Result<()> {
+/// A recording that is empty, or an address that is none; the display's port or connection cannot be made.
+async fn run(app: &App, address: SocketAddr, now: Timestamp) -> anyhow::Result<()> {
     // Phones report whole seconds.
     let now = Timestamp::from_second(now.as_second())?;
     let address = reachable(address);
-    let mut feeds: Vec<BoxFuture<'_, ()>> = Vec::new();
-    for place in places() {
-        let site = simulate_site(&place.options);
-        for ((id, _), items) in place.cameras.iter().zip(items(&place, &site)) {
+    let display = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await?;
+    create_display(app, display.local_addr()?).await?;
+    let mut feeds: Vec<BoxFuture<'_, ()>> = vec![Box::pin(receive_forever(display))];
+    for scene in scenes() {
+        let site = simulate_site(&scene.options);
+        for ((id, _), items) in scene.cameras.iter().zip(items(&scene, &site)) {
             feeds.push(Box::pin(stream(
                 address,
                 CameraId::new(id)?,
-                recording(&place, items)?,
-                place.identities,
+                recording(&scene, items)?,
+                scene.identities,
                 now,
             )));
         }
-        if place.identities == Identities::Phones {
+        if scene.identities == Identities::Phones {
             let phones = Source { address, connection: ConnectionId::new(PHONES)? };
-            feeds.push(Box::pin(report_forever(phones, phone_reports(&place, &site), now, phone_message)));
+            feeds.push(Box::pin(report_forever(phones, phone_reports(&scene, &site), now, phone_message)));
             let ship = Source { address, connection: ConnectionId::new(SHIP)? };
-            feeds.push(Box::pin(report_forever(ship, ship_reports(&place), now, ship_message)));
+            feeds.push(Box::pin(report_forever(ship, ship_reports(&scene), now, ship_message)));
         }
     }
     let stop = app.demonstration.begin(parts()?);
@@ -188,16 +223,16 @@ pub(super) async fn run(app: &App, address: SocketAddr, now: Timestamp) -> anyho
 
 /// The parts that the end of the demonstration removes.
 fn parts() -> anyhow::Result<DemonstrationParts> {
-    let cameras = places().into_iter().flat_map(|place| place.cameras);
+    let cameras = scenes().into_iter().flat_map(|scene| scene.cameras);
     let cameras = cameras.map(|(id, _)| CameraId::new(id)).collect::<Result<_, _>>()?;
-    let connections = vec![ConnectionId::new(PHONES)?, ConnectionId::new(SHIP)?];
+    let connections = [PHONES, SHIP, DISPLAY].map(ConnectionId::new).into_iter().collect::<Result<_, _>>()?;
     Ok(DemonstrationParts { cameras, sites: vec![SiteId::new(SITE)?], connections })
 }
 
-fn recording(place: &Place, items: Vec<LiveItem>) -> anyhow::Result<RecordedStream> {
+fn recording(scene: &Scene, items: Vec<LiveItem>) -> anyhow::Result<RecordedStream> {
     let period = SignedDuration::from_secs(PERIOD_S.into());
-    let interval = SignedDuration::from_secs_f64(place.options.frame_interval_s);
-    Ok(RecordedStream::periodic(items, place.options.start, period, interval)?)
+    let interval = SignedDuration::from_secs_f64(scene.options.frame_interval_s);
+    Ok(RecordedStream::periodic(items, scene.options.start, period, interval)?)
 }
 
 /// Streams the recording of one camera again and again.

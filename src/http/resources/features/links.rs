@@ -9,7 +9,6 @@ use crate::http::plumbing::problem::ApiError;
 use crate::request::RequestContext;
 
 pub(super) const JSON: &str = "application/json";
-pub(super) const GEOJSON: &str = "application/geo+json";
 
 /// A link (RFC 8288).
 #[derive(Serialize, ToSchema)]

@@ -8,10 +8,7 @@ mod links;
 mod query;
 mod sources;
 
-use axum::response::Response;
 use hyper::Uri;
-use hyper::header::CONTENT_TYPE;
-use hyper::http::HeaderValue;
 use hyper::http::request::Parts;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -21,14 +18,14 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use self::collection::CollectionId;
-use self::links::{BaseUrl, GEOJSON, JSON, Link};
+use self::links::{BaseUrl, JSON, Link};
 use self::query::Selection;
 use self::sources::{Feature, FeaturePage};
 use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::extract::{Params, path};
 use crate::http::plumbing::problem::{ApiError, ApiResult, Problem};
 use crate::http::plumbing::state::Rest;
-use crate::http::plumbing::wire::json;
+use crate::http::plumbing::wire::{GEOJSON, geojson, json};
 
 /// Requirements classes of the standard that are satisfied.
 const CONFORMANCE: [&str; 2] = [
@@ -252,13 +249,13 @@ async fn list_features(
     if let Some(next) = next {
         links.push(base.link("next", GEOJSON, &format!("{path}?{}", selection.to_query(&next))));
     }
-    geojson(&FeatureCollection {
+    Ok(geojson(&FeatureCollection {
         r#type: "FeatureCollection",
         time_stamp: app.clock.now(),
         number_returned: features.len(),
         links,
         features: features.into_iter().map(|feature| GeoJsonFeature::new(feature, Vec::new())).collect(),
-    })
+    })?)
 }
 
 /// Read a feature
@@ -284,13 +281,7 @@ async fn get_feature(
         base.link("self", GEOJSON, &format!("{collection}/items/{}", links::segment(&feature.id))),
         base.link("collection", JSON, &collection),
     ];
-    geojson(&GeoJsonFeature::new(feature, links))
-}
-
-fn geojson(value: &impl Serialize) -> ApiResult<Response> {
-    let mut response = json(value)?;
-    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(GEOJSON));
-    Ok(response)
+    Ok(geojson(&GeoJsonFeature::new(feature, links))?)
 }
 
 #[derive(Deserialize)]

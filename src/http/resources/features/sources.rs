@@ -92,7 +92,7 @@ pub(super) async fn one(app: &App, collection: &CollectionId, id: &str) -> Resul
     match collection {
         CollectionId::Cameras => {
             let camera = CameraId::new(id).map_err(|_| unknown())?;
-            camera_feature(app.camera_status(&camera).await?)
+            camera_feature(app.camera_statuses().get(&camera).await?)
         }
         CollectionId::Samples(camera) => {
             let key: SampleKey = read_cursor("feature", id).map_err(|_| unknown())?;
@@ -105,7 +105,7 @@ pub(super) async fn one(app: &App, collection: &CollectionId, id: &str) -> Resul
             found.filter(|sample| SampleKey::of(sample) == key).map(sample_feature).ok_or_else(unknown)?
         }
         CollectionId::Tracks(camera) => {
-            let latest = app.tracks(camera).await?;
+            let latest = app.live().tracks(camera).await?;
             let own = latest.iter().find(|point| point.target_id.as_str() == id);
             own.map(|point| track_feature(point)).ok_or_else(unknown)?
         }
@@ -114,7 +114,7 @@ pub(super) async fn one(app: &App, collection: &CollectionId, id: &str) -> Resul
 
 async fn cameras(app: &App, selection: &Selection, cursor: Option<&str>) -> Result<FeaturePage> {
     let after: Option<CameraId> = cursor.map(|text| read_cursor("cursor", text)).transpose()?;
-    let page = app.camera_statuses(after.as_ref(), selection.limit).await?;
+    let page = app.camera_statuses().list(after.as_ref(), selection.limit).await?;
     let features = page.items.into_iter().map(camera_feature).collect::<Result<Vec<_>>>()?;
     let area = selection.area.as_ref();
     Ok(FeaturePage {
@@ -171,7 +171,7 @@ async fn tracks(
     cursor: Option<&str>,
 ) -> Result<FeaturePage> {
     let after: Option<TargetId> = cursor.map(|text| read_cursor("cursor", text)).transpose()?;
-    let latest = app.tracks(camera).await?;
+    let latest = app.live().tracks(camera).await?;
     let area = selection.area.as_ref();
     let mut selected = latest.iter().filter(|point| {
         after.as_ref().is_none_or(|after| point.target_id > *after)

@@ -1,0 +1,182 @@
+//! Queries and deletions of the history.
+
+use std::ops::ControlFlow;
+
+use tokio::sync::mpsc;
+
+use super::queue::{ArchivedHistory, on_archive};
+use crate::app::active_cameras::ActiveCameras;
+use crate::app::registry::Registry;
+use crate::app::{App, Page, page_of};
+use crate::archive::{Archive, BoundingArea, Selection};
+use crate::clock::Clock;
+use crate::domain::{
+    ArchivedPosition, Error, ErrorKind, HistoryKey, ReceiverId, Result, TargetClass, TargetId, TrackScope,
+};
+use crate::store::Store;
+use jiff::Timestamp;
+
+/// Rows that are handed over at once.
+const BATCH: usize = 1_024;
+/// Batches that wait for a slow reader.
+const WAITING: usize = 4;
+
+/// Which positions of a camera or a site are asked for.
+#[derive(Debug, Clone, Default)]
+pub struct HistorySelection {
+    /// Not before this instant.
+    pub from: Option<Timestamp>,
+    /// Before this instant.
+    pub until: Option<Timestamp>,
+    /// Within this area.
+    pub area: Option<BoundingArea>,
+    /// Of this class.
+    pub class: Option<TargetClass>,
+    /// Of this target.
+    pub target: Option<TargetId>,
+    /// Of the carrier of this receiver.
+    pub receiver: Option<ReceiverId>,
+    /// Of this track.
+    pub track: Option<String>,
+}
+
+/// Positions as they are read, in batches; they end early with an error.
+pub struct HistoryRows {
+    batches: mpsc::Receiver<Result<Vec<ArchivedPosition>>>,
+}
+
+impl HistoryRows {
+    /// The next positions, in order of time and track; `None` after the last.
+    ///
+    /// # Errors
+    /// A fault of the archive.
+    pub async fn next(&mut self) -> Result<Option<Vec<ArchivedPosition>>> {
+        self.batches.recv().await.transpose()
+    }
+}
+
+/// The use cases of the history.
+#[derive(Clone, Copy)]
+pub struct History<'a> {
+    pub(super) archived: &'a ArchivedHistory,
+    pub(super) store: &'a Store,
+    pub(super) registry: &'a Registry,
+    cameras: ActiveCameras<'a>,
+    pub(super) clock: &'a Clock,
+}
+
+impl App {
+    /// The use cases of the history.
+    #[must_use]
+    pub fn history(&self) -> History<'_> {
+        History {
+            archived: &self.archived_history,
+            store: &self.store,
+            registry: &self.registry,
+            cameras: self.active_cameras(),
+            clock: &self.clock,
+        }
+    }
+}
+
+impl History<'_> {
+    /// A page of positions in order of time and track.
+    ///
+    /// # Errors
+    /// `CameraNotFound`, `SiteNotFound`; `PermissionDenied` for a camera that the key is not for; `InvalidArgument`.
+    pub async fn page(
+        &self,
+        scope: TrackScope,
+        selection: HistorySelection,
+        after: Option<HistoryKey>,
+        limit: u32,
+    ) -> Result<Page<ArchivedPosition, HistoryKey>> {
+        let selection = self.selected(&scope, selection).await?;
+        let rows = on_archive(self.archive()?, move |archive| {
+            let mut rows = Vec::new();
+            archive.scan(&scope, &selection, after, |row| {
+                rows.push(row);
+                if rows.len() > limit as usize { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            })?;
+            Ok(rows)
+        })
+        .await?;
+        Ok(page_of(rows, limit, |row| HistoryKey::from(row)))
+    }
+
+    /// All positions in order of time and track, read as they are taken.
+    ///
+    /// # Errors
+    /// As [`History::page`].
+    pub async fn rows(&self, scope: TrackScope, selection: HistorySelection) -> Result<HistoryRows> {
+        let selection = self.selected(&scope, selection).await?;
+        let archive = self.archive()?.clone();
+        let (sender, batches) = mpsc::channel(WAITING);
+        tokio::task::spawn_blocking(move || send_rows(&archive, &scope, &selection, &sender));
+        Ok(HistoryRows { batches })
+    }
+
+    /// Deletes positions in every file, and returns their number.
+    ///
+    /// # Errors
+    /// As [`History::page`].
+    pub async fn delete(&self, scope: TrackScope, selection: HistorySelection) -> Result<u64> {
+        let selection = self.selected(&scope, selection).await?;
+        self.archived.flush().await;
+        on_archive(self.archive()?, move |archive| archive.delete(&scope, &selection)).await
+    }
+
+    fn archive(&self) -> Result<&Archive> {
+        let closed = || Error::refused(ErrorKind::Overloaded, "this process has not opened the archive");
+        self.archived.archive.get().ok_or_else(closed)
+    }
+
+    /// The selection of rows of a scope that exists and that the caller may read.
+    async fn selected(&self, scope: &TrackScope, selection: HistorySelection) -> Result<Selection> {
+        let HistorySelection { from, until, area, class, target, receiver, track } = selection;
+        if from.zip(until).is_some_and(|(from, until)| from >= until) {
+            return Err(Error::invalid("until", "must be after from"));
+        }
+        if target.is_some() && receiver.is_some() {
+            return Err(Error::invalid("receiver_id", "is not possible beside target_id"));
+        }
+        let receivers = match scope {
+            TrackScope::Camera(id) => Some(self.cameras.get(id).await?),
+            TrackScope::Site(id) => {
+                self.store.site(id).await?;
+                None
+            }
+        };
+        let carrier = receiver.and_then(|receiver| {
+            let camera = receivers.as_ref();
+            let declared = camera.and_then(|camera| camera.receivers.get(&receiver));
+            declared.map(|own| own.target_id.clone()).or_else(|| TargetId::new(receiver.as_str()).ok())
+        });
+        let targets = target.or(carrier).into_iter().collect();
+        Ok(Selection { from, until, area, class, targets, track })
+    }
+}
+
+fn send_rows(
+    archive: &Archive,
+    scope: &TrackScope,
+    selection: &Selection,
+    sender: &mpsc::Sender<Result<Vec<ArchivedPosition>>>,
+) {
+    let mut batch = Vec::with_capacity(BATCH);
+    let scanned = archive.scan(scope, selection, None, |row| {
+        batch.push(row);
+        if batch.len() < BATCH {
+            return ControlFlow::Continue(());
+        }
+        let full = std::mem::replace(&mut batch, Vec::with_capacity(BATCH));
+        // The reader has gone.
+        if sender.blocking_send(Ok(full)).is_err() {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
+        }
+    });
+    // The reader may have gone.
+    let _ = sender.blocking_send(scanned.map(|()| batch));
+}

@@ -98,4 +98,21 @@ test('a world file and a georeferenced TIFF say where an image lies', async ({ c
   expect(first).toEqual({ longitude_deg: 11.5, latitude_deg: 48.1 });
   expect(last.longitude_deg).toBeCloseTo(11.5 + WIDTH * 0.00002, 9);
   expect(last.latitude_deg).toBeCloseTo(48.1 - HEIGHT * 0.00001, 9);
+
+  // Half a metre per pixel in zone 35 of UTM. PROJ converts the corner: gdaltransform -s_srs EPSG:32635 -t_srs EPSG:4326.
+  const utm = await writeArrayBuffer(new Uint8Array(3 * WIDTH * HEIGHT).fill(90), {
+    width: WIDTH,
+    height: HEIGHT,
+    SamplesPerPixel: 3,
+    BitsPerSample: [8, 8, 8],
+    PhotometricInterpretation: 2,
+    ModelPixelScale: [0.5, 0.5, 0],
+    ModelTiepoint: [0, 0, 0, 372_000, 6_590_000, 0],
+    ProjectedCSTypeGeoKey: 32635,
+    GTModelTypeGeoKey: 1,
+  });
+  await drop(page, [{ name: 'harbour.tif', mimeType: 'image/tiff', buffer: Buffer.from(utm as ArrayBuffer) }]);
+  const [corner] = await kept(page);
+  expect(corner.longitude_deg).toBeCloseTo(24.7436530128744, 8);
+  expect(corner.latitude_deg).toBeCloseTo(59.429058724256, 8);
 });

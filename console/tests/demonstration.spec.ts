@@ -40,6 +40,8 @@ test('the demonstration moves, says that it is simulated, and ends by its button
   // The ship has no box; a camera with a dozen people sees some of them.
   const world = async (): Promise<{ target_id?: string }[]> => (await server.request<{ items: { target_id?: string }[] }>('GET', '/v1/sites/demo-square/tracks')).items;
   await expect.poll(async () => (await world()).map((track) => track.target_id), { timeout: 60_000 }).toContain('276000001');
+  const events = async (): Promise<unknown[]> => (await server.request<{ items: unknown[] }>('GET', '/v1/place-events?site=demo-square')).items;
+  await expect.poll(async () => (await events()).length, { timeout: 120_000 }).toBeGreaterThan(0);
   await page.goto(`${server.url}/#/cameras/demo-middle/live`);
   await expect(page.getByRole('button', { name: /^tracker:\d/ }).first()).toBeVisible();
   expect(await accessibilityFindings(page)).toEqual([]);

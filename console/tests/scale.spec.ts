@@ -1,7 +1,12 @@
-// Two thousand cameras.
+// Two thousand cameras, ten thousand, and two hundred targets.
+import { spawn } from 'node:child_process';
+import { mkdtempSync, rmSync, writeFileSync } from 'node:fs';
+import { tmpdir } from 'node:os';
+import { join } from 'node:path';
 import type { Locator, Page } from '@playwright/test';
 import type { CameraStatus, Page as ApiPage } from '../src/lib/types';
 import { expect, test } from './fixtures';
+import { BINARY } from './server';
 import { addCamera, simulate, walk } from './world';
 
 const CAMERAS = 2000;
@@ -26,6 +31,38 @@ async function townOf(page: Page): Promise<void> {
     });
     await route.fulfill({ response, json: answer });
   });
+}
+
+/** Frames that the page draws while something goes on: a second, and the longest, ms. For information: this machine may be busy. */
+async function frames(page: Page, during: () => Promise<void>): Promise<string> {
+  await page.evaluate(() => {
+    const frames_ms: number[] = [];
+    Object.assign(window, { frames_ms });
+    const measure = (before_ms: number) => (now_ms: number) => {
+      frames_ms.push(now_ms - before_ms);
+      requestAnimationFrame(measure(now_ms));
+    };
+    requestAnimationFrame(measure(performance.now()));
+  });
+  await during();
+  const taken = await page.evaluate(() => (window as unknown as { frames_ms: number[] }).frames_ms);
+  const total_ms = taken.reduce((sum, frame) => sum + frame, 0);
+  return `${((1000 * taken.length) / total_ms).toFixed(0)} frames a second, longest ${Math.max(...taken).toFixed(0)} ms`;
+}
+
+/** A recording of targets that walk in circles, each with a fix at every instant, as CSV. */
+function recordingOf(targets: number, seconds: number, rate_hz: number): string {
+  const start_ms = Date.UTC(2026, 0, 5, 8);
+  const rows = ['time,target_id,longitude,latitude'];
+  for (let at = 0; at < seconds * rate_hz; at++) {
+    const time = new Date(start_ms + (1000 * at) / rate_hz).toISOString();
+    for (let n = 0; n < targets; n++) {
+      const angle = (at / rate_hz) * 0.2 + n;
+      const radius_deg = 0.0001 + (n % 20) * 0.00002;
+      rows.push(`${time},walker-${n},${(24.745 + radius_deg * 2 * Math.cos(angle)).toFixed(7)},${(59.437 + radius_deg * Math.sin(angle)).toFixed(7)}`);
+    }
+  }
+  return rows.join('\n') + '\n';
 }
 
 interface Counted {
@@ -70,8 +107,10 @@ test('two thousand cameras scroll with work for the rows that come alone, and th
     const batch = Array.from({ length: 50 }, (_, at) => from + at);
     await Promise.all(batch.map((n) => server.request('POST', '/v1/cameras', { id: `camera-${n}`, display_name: `Camera ${String(n).padStart(4, '0')}`, labels: { site: `s${n % 7}` } })));
   }
+  // The page that is open polls, and would take statuses that the next one needs.
+  await page.goto('about:blank');
   await townOf(page);
-  await page.reload();
+  await page.goto(`${server.url}/`);
   await expect(page.getByRole('heading', { name: 'Cameras 2,000' })).toBeVisible();
   const list = page.getByRole('list', { name: 'Cameras' });
   const rows = list.getByRole('listitem');
@@ -97,27 +136,17 @@ test('two thousand cameras scroll with work for the rows that come alone, and th
   await page.waitForTimeout(1500);
   expect(await taken()).toEqual({ added: 0, removed: 0, paints: 0 });
 
-  // Frames under the wheel, for information: this machine may be busy.
   await list.hover();
-  await page.evaluate(() => {
-    const frames: number[] = [];
-    Object.assign(window, { frames });
-    const measure = (before_ms: number) => (now_ms: number) => {
-      frames.push(now_ms - before_ms);
-      requestAnimationFrame(measure(now_ms));
-    };
-    requestAnimationFrame(measure(performance.now()));
-  });
   await taken();
-  for (let turn = 0; turn < 60; turn++) {
-    await page.mouse.wheel(0, 240);
-    await page.evaluate(() => new Promise(requestAnimationFrame));
-  }
+  const turned = await frames(page, async () => {
+    for (let turn = 0; turn < 60; turn++) {
+      await page.mouse.wheel(0, 240);
+      await page.evaluate(() => new Promise(requestAnimationFrame));
+    }
+  });
   // The camera under the mouse is another one again and again: it is marked above the map.
   expect((await taken()).paints, 'the map under the marks').toBe(0);
-  const frames_ms = (await page.evaluate(() => (window as unknown as { frames: number[] }).frames)).sort((a, b) => a - b);
-  const quantile = (share: number): string => `${frames_ms[Math.floor(share * (frames_ms.length - 1))]!.toFixed(1)} ms`;
-  console.log(`frames while the wheel turns over ${CAMERAS} cameras: median ${quantile(0.5)}, 95th percentile ${quantile(0.95)}, longest ${quantile(1)} (${frames_ms.length} frames)`);
+  console.log(`while the wheel turns over ${CAMERAS} cameras: ${turned}`);
 
   for (let turn = 0; turn < 10; turn++) {
     await page.mouse.wheel(0, 4000);
@@ -185,28 +214,34 @@ test('ten thousand cameras are drawn as clusters, whose numbers make ten thousan
   await expect.poll(async () => inClusters(await drawn())).toBe(many);
   expect((await drawn()).length).toBeLessThan(1000);
 
-  // Frames while the map is dragged, for information: this machine may be busy.
   const area = (await page.getByRole('application').boundingBox())!;
   await page.mouse.move(area.x + area.width / 2, area.y + area.height / 2);
   await page.mouse.down();
-  const frames_ms = await page.evaluate(() => {
-    const frames: number[] = [];
-    Object.assign(window, { frames });
-    const measure = (before_ms: number) => (now_ms: number) => {
-      frames.push(now_ms - before_ms);
-      requestAnimationFrame(measure(now_ms));
-    };
-    requestAnimationFrame(measure(performance.now()));
-    return frames.length;
+  const dragged = await frames(page, async () => {
+    for (let step = 1; step <= 60; step++) {
+      await page.mouse.move(area.x + area.width / 2 + 3 * step, area.y + area.height / 2 + step);
+      await page.evaluate(() => new Promise(requestAnimationFrame));
+    }
   });
-  for (let step = 1; step <= 60; step++) {
-    await page.mouse.move(area.x + area.width / 2 + 3 * step, area.y + area.height / 2 + step);
-    await page.evaluate(() => new Promise(requestAnimationFrame));
-  }
   await page.mouse.up();
-  const taken = (await page.evaluate(() => (window as unknown as { frames: number[] }).frames)).slice(frames_ms).sort((a, b) => a - b);
-  const total_ms = taken.reduce((sum, frame) => sum + frame, 0);
-  console.log(`frames while the map of ${many} cameras is dragged: ${((1000 * taken.length) / total_ms).toFixed(0)} a second, longest ${taken.at(-1)!.toFixed(0)} ms`);
+  console.log(`while the map of ${many} cameras is dragged: ${dragged}`);
+});
+
+test('two hundred targets move at ten positions a second each', async ({ console: page, server }) => {
+  const [targets, seconds, rate_hz] = [200, 20, 10];
+  await server.request('POST', '/v1/cameras', { id: 'square', display_name: 'Square' });
+  const folder = mkdtempSync(join(tmpdir(), 'sightfix-walkers-'));
+  const file = join(folder, 'walkers.csv');
+  writeFileSync(file, recordingOf(targets, seconds, rate_hz));
+  await page.goto(`${server.url}/#/cameras/square/live`);
+  await page.reload();
+  const replay = spawn(BINARY, ['replay', file, '--server', server.url, '--camera', 'square', '--shift-to-now', '--quiet'], { stdio: 'ignore' });
+  const ended = new Promise((done) => replay.once('exit', done));
+  await expect(page.getByRole('button', { name: /^walker-/ })).toHaveCount(targets);
+  const moving = await frames(page, () => page.waitForTimeout(8000));
+  console.log(`while ${targets} targets move at ${rate_hz} Hz: ${moving}`);
+  expect(await ended).toBe(0);
+  rmSync(folder, { recursive: true });
 });
 
 test('targets of a live camera are on the map of all cameras', async ({ console: page, server }) => {

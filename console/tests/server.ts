@@ -11,19 +11,21 @@ export class Server {
   readonly #folder = mkdtempSync(join(tmpdir(), 'sightfix-console-'));
   readonly #settings: Record<string, string>;
   readonly #flags: string[];
+  readonly #binary: string;
   /** Whether the data folder is a disk of its own. */
   #hasDisk = false;
   #process: ChildProcess | undefined;
   url = '';
 
-  private constructor(settings: Record<string, string>, flags: string[]) {
+  private constructor(settings: Record<string, string>, flags: string[], binary: string) {
     this.#settings = settings;
     this.#flags = flags;
+    this.#binary = binary;
   }
 
   /** `disk` is the size of a disk of its own for the data folder, such as `24m`; mounting it needs the superuser. */
-  static async start(settings: Record<string, string> = {}, disk = '', listen = '127.0.0.1:0', flags: string[] = []): Promise<Server> {
-    const server = new Server(settings, flags);
+  static async start(settings: Record<string, string> = {}, disk = '', listen = '127.0.0.1:0', flags: string[] = [], binary = BINARY): Promise<Server> {
+    const server = new Server(settings, flags, binary);
     if (disk) {
       execFileSync('mount', ['-t', 'tmpfs', '-o', `size=${disk}`, 'tmpfs', server.#folder]);
       server.#hasDisk = true;
@@ -36,7 +38,7 @@ export class Server {
   async run(listen: string): Promise<void> {
     // Settings of whoever runs the tests are not the test's.
     const inherited = Object.fromEntries(Object.entries(process.env).filter(([name]) => !name.startsWith('SIGHTFIX_')));
-    const child = spawn(BINARY, ['serve', '--data', this.#folder, '--listen', listen, ...this.#flags], {
+    const child = spawn(this.#binary, ['serve', '--data', this.#folder, '--listen', listen, ...this.#flags], {
       env: { ...inherited, SIGHTFIX_LOG_FORMAT: 'json', ...this.#settings },
       stdio: ['ignore', 'ignore', 'pipe'],
       cwd: tmpdir(),

@@ -28,7 +28,7 @@ async function showNotActivated(page: Page, { id, report }: SiteTrainingRun): Pr
   const outcome = 'no version became active: of camera c2: 3.100 m from 80 held-out fixes against 2.900 m of version 1; activate them camera by camera if they are the better';
   await page.route(`**${RUNS}?*`, (route) => route.fulfill({ json: { items: [{ id, site_id: 'street', seed: 3, state: 'succeeded', progress: { epoch: 69, epochs: 69 }, outcome, report: { ...report, is_activated: false, disagreement_m: undefined }, created_at: '2026-01-05T09:00:00Z' }] } }));
   await page.reload();
-  await expect(page.locator('.training .notice.warning')).toHaveText(/^The versions are stored, but none became active\. of camera c2: 3\.100 m from 80 .* if they are the better$/);
+  await expect(page.locator('.content .notice.warning')).toHaveText(/^The versions are stored, but none became active\. of camera c2: 3\.100 m from 80 .* if they are the better$/);
   await expect(page.getByText('How far the cameras disagree could not be measured')).toBeVisible();
   expect(await accessibilityFindings(page), 'not activated').toEqual([]);
   await page.unroute(`**${RUNS}?*`);
@@ -37,7 +37,7 @@ async function showNotActivated(page: Page, { id, report }: SiteTrainingRun): Pr
 test('a site is trained together: started, cancelled, started again, reported', async ({ console: page, server }) => {
   test.setTimeout(1_200_000);
   await addSite(server, simulateSite(14, 600));
-  await page.goto(`${server.url}/#/sites/street`);
+  await page.goto(`${server.url}/#/sites/street/training`);
   await expect(page.getByRole('heading', { name: 'No training run of this site yet' })).toBeVisible();
   const start = page.getByRole('button', { name: 'Start training' });
   await start.click();
@@ -103,7 +103,7 @@ test('a site is trained together: started, cancelled, started again, reported', 
     expect(await accessibilityFindings(page), theme).toEqual([]);
     if (!PICTURES) continue;
     mkdirSync(PICTURES, { recursive: true });
-    await page.locator('.training').screenshot({ path: `${PICTURES}/site-training-${theme}.png` });
+    await page.locator('.content').screenshot({ path: `${PICTURES}/site-training-${theme}.png` });
   }
   await showNotActivated(page, run!);
   await page.evaluate(() => localStorage.setItem('sightfix.language', 'de'));
@@ -121,10 +121,10 @@ test.describe('a refused run', () => {
   test('of a site that cannot be trained says why', async ({ console: page, server }) => {
     const { c1, c2 } = simulateSite(8, 60) as { c1: string; c2: string };
     await addSite(server, { c1, c2: c2.split('\n').slice(0, 16).join('\n') });
-    await page.goto(`${server.url}/#/sites/street`);
+    await page.goto(`${server.url}/#/sites/street/training`);
     const start = page.getByRole('button', { name: 'Start training' });
     await expect(page.getByText('Too few samples for a run, which needs at least 20 of each camera:')).toBeVisible();
-    await expect(page.locator('.training').getByRole('link', { name: 'Camera c2' })).toHaveAttribute('href', '#/cameras/c2/data');
+    await expect(page.locator('.content').getByRole('link', { name: 'Camera c2' })).toHaveAttribute('href', '#/cameras/c2/data');
     await expect(start).toBeDisabled();
     await server.request('POST', '/v1/cameras/c2/samples', c2, 'text/csv');
     await expect(start).toBeEnabled();

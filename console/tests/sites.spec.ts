@@ -22,6 +22,12 @@ test('two cameras of a site, named in their profiles, show one track per target'
   const targets = page.locator('.targets tbody tr');
   await expect(targets.filter({ hasText: 'north, south' }).first()).toBeVisible({ timeout: 60_000 });
   expect(await targets.count()).toBeLessThan(4);
+  // One of them in detail.
+  await targets.filter({ hasText: 'north, south' }).first().getByRole('button').click();
+  const details = page.getByRole('region', { name: /^Details of/ });
+  await expect(details.getByRole('link')).toHaveText(['north', 'south']);
+  await expect(details.getByText(/^\d+\.\d{7}, \d+\.\d{7}$/)).toBeVisible();
+  await expect(details).toContainText(/Way that is shown[\d.,]+ m, \d+ points/);
   // The tracks are drawn in the colour of what is fused.
   const drawn = await page.locator('.plane-canvas').evaluate((element) => {
     const canvas = element as HTMLCanvasElement;
@@ -34,6 +40,10 @@ test('two cameras of a site, named in their profiles, show one track per target'
   });
   expect(drawn).toBeGreaterThan(20);
   expect(await accessibilityFindings(page)).toEqual([]);
+  await page.goto(`${server.url}/#/cameras/north/live`);
+  await page.getByRole('button', { name: 'person-1' }).click();
+  await expect(details).toContainText(/Receiverperson-1/);
+  await expect(details.getByRole('link')).toHaveText(['north']);
   stops.forEach((stop) => stop());
   await page.goto(`${server.url}/#/cameras`);
   await expect(page.getByRole('link', { name: 'plaza', exact: true })).toBeVisible();

@@ -3,6 +3,7 @@ import { mkdirSync } from 'node:fs';
 import { resolve } from 'node:path';
 import type { Page } from '@playwright/test';
 import { accessibilityFindings, expect, test } from './fixtures';
+import { boundsOf } from '../src/lib/geo';
 import { stillOf } from './still';
 import { addCamera, rowsOf, simulate, walk, type SimulatedCamera } from './world';
 import type { Server } from './server';
@@ -24,6 +25,9 @@ const VIEWS: [name: string, path: string, ready: (page: Page) => Promise<void>][
   ['setup', '#/cameras/north-gate/setup', (page) => expect(page.getByText(/Model version \d+ answers|Modellversion \d+ antwortet/)).toBeVisible()],
   ['scene', '#/cameras/north-gate/scene', (page) => expect(page.getByText(/mean [\d.]+ m|Mittel [\d,]+ m/)).toBeVisible()],
   ['live', '#/cameras/north-gate/live', (page) => expect(page.getByRole('button', { name: 'person-1' })).toBeVisible()],
+  ['places', '#/cameras/north-gate/places', chooseSquare],
+  ['place-form', '#/cameras/north-gate/places', openSquare],
+  ['history', '#/cameras/north-gate/history', (page) => expect(page.getByRole('slider')).toBeVisible()],
   ['data', '#/cameras/north-gate/data', (page) => expect(page.locator('.notice').first()).toBeVisible()],
   ['training', '#/cameras/north-gate/training', (page) => expect(page.locator('table')).toBeVisible()],
   ['models', '#/cameras/north-gate/models', (page) => expect(page.locator('table').first()).toBeVisible()],
@@ -31,6 +35,10 @@ const VIEWS: [name: string, path: string, ready: (page: Page) => Promise<void>][
   ['try-it', '#/cameras/north-gate/try', (page) => expect(page.locator('.weights')).toBeVisible()],
   ['profile', '#/cameras/north-gate/profile', (page) => expect(page.getByText('north-gate').first()).toBeVisible()],
   ['site', '#/sites/old-town', (page) => expect(page.locator('.targets tbody tr').first()).toBeVisible({ timeout: 60_000 })],
+  ['site-places', '#/sites/old-town/places', (page) => expect(page.getByRole('listitem')).toHaveCount(1)],
+  ['site-history', '#/sites/old-town/history', (page) => expect(page.getByRole('slider')).toBeVisible()],
+  ['site-training', '#/sites/old-town/training', (page) => expect(page.locator('main .panel').first()).toBeVisible()],
+  ['site-profile', '#/sites/old-town/profile', (page) => expect(page.getByRole('checkbox')).toBeVisible()],
   ['settings', '#/settings/health', (page) => expect(page.getByText('/metrics')).toBeVisible()],
   ['connections', '#/settings/connections', (page) => expect(page.getByRole('article')).toHaveCount(3)],
   ['keys', '#/settings/keys', (page) => expect(page.locator('main .panel')).toBeVisible()],
@@ -38,6 +46,16 @@ const VIEWS: [name: string, path: string, ready: (page: Page) => Promise<void>][
   ['limits', '#/settings/limits', (page) => expect(page.getByText('page_items')).toBeVisible()],
   ['walk', 'walk#camera=north-gate&receiver=phone-1', (page) => expect(page.locator('.record')).toBeVisible()],
 ];
+
+async function chooseSquare(page: Page): Promise<void> {
+  await page.getByRole('button', { name: 'Square', exact: true }).click();
+  await expect(page.getByRole('img', { name: /Targets per interval|Ziele je Intervall/ })).toBeVisible();
+}
+
+async function openSquare(page: Page): Promise<void> {
+  await page.getByRole('button', { name: /^(Edit Square|Square bearbeiten)$/ }).click();
+  await expect(page.getByRole('button', { name: /^(Corner|Ecke) 4$/ })).toBeVisible();
+}
 
 interface Town {
   /** The world of the camera that is looked at. */
@@ -62,8 +80,22 @@ async function buildTown(server: Server): Promise<Town> {
   await connect(server);
   await server.request('POST', '/v1/sites', { id: 'old-town', display_name: 'Old town' });
   for (const [camera] of town.slice(0, 3)) await server.request('PATCH', `/v1/cameras/${camera}`, { site: 'old-town' }, 'application/merge-patch+json', { 'if-match': '*' });
+  await addPlaces(server, worlds[0]!);
   const stops = town.slice(0, 3).map(([camera], at) => walk(server, camera, worlds[at]!.live, 2 * at + 1));
   return { world: worlds[0]!, stop: () => stops.forEach((stop) => stop()) };
+}
+
+/** The square's western half, for a camera and for the site, and a line across the square. */
+async function addPlaces(server: Server, { live }: SimulatedCamera): Promise<void> {
+  const positions = live.flatMap(({ truth }) => (truth ? [truth] : []));
+  const bounds = boundsOf(positions)!;
+  const middle_deg = (bounds.west + bounds.east) / 2;
+  const ring = [[bounds.west, bounds.south], [middle_deg, bounds.south], [middle_deg, bounds.north], [bounds.west, bounds.north], [bounds.west, bounds.south]];
+  const area = { display_name: 'Square', geometry: { type: 'Polygon', coordinates: [ring] }, probability: 0.8, rules: [{ id: 'enter', kind: 'enter' }, { id: 'leave', kind: 'leave' }] };
+  const line = { type: 'LineString', coordinates: [[middle_deg, bounds.south], [middle_deg, bounds.north]] };
+  await server.request('POST', '/v1/places', { ...area, id: 'square', camera_id: 'north-gate' });
+  await server.request('POST', '/v1/places', { ...area, id: 'old-square', site_id: 'old-town' });
+  await server.request('POST', '/v1/places', { id: 'line', display_name: 'Line', camera_id: 'north-gate', geometry: line, rules: [{ id: 'cross', kind: 'cross' }] });
 }
 
 /** A source that has taken a message, one whose peer is away, and a sink. */
@@ -129,6 +161,20 @@ test('every view is accessible, fits and can be shown', async ({ console: page, 
     if (PICTURES && (name === 'overview' || name === 'scene')) await page.screenshot({ path: `${PICTURES}/${name}-phone.png` });
   }
   stop();
+});
+
+test.describe('the description of the interface', () => {
+  // The checks are run in the page, whose policy allows its own scripts alone.
+  test.use({ bypassCSP: true });
+
+  test('is accessible, also where an operation is open', async ({ console: page, server }) => {
+    await page.goto(`${server.url}/docs/`);
+    await expect(page.getByRole('button', { name: /^GET \/v1\/cameras( |$)/ })).toBeVisible();
+    expect(await accessibilityFindings(page)).toEqual([]);
+    await page.getByRole('button', { name: /\/v1\/cameras\/\S*fusions( |$)/ }).first().click();
+    await expect(page.getByRole('heading', { name: 'Responses' })).toBeVisible();
+    expect(await accessibilityFindings(page)).toEqual([]);
+  });
 });
 
 test('the keyboard reaches a camera and its tabs', async ({ console: page, server }) => {

@@ -1,4 +1,4 @@
-// Whether this server asks for a key.
+// Whether this server asks for a key, and what the signed-in caller may do.
 import { get } from './api';
 import type { Session } from './types';
 
@@ -6,10 +6,17 @@ class Access {
   needsKey = $state(false);
 
   load(): void {
-    void get<Session>('/v1/session').then(
-      ({ open_access }) => (this.needsKey = !open_access),
-      () => undefined,
-    );
+    void this.#session().then((session) => (this.needsKey = session?.open_access === false));
+  }
+
+  /** Viewers read; everybody else may also send what cameras measure. */
+  async mayIngest(): Promise<boolean> {
+    const session = await this.#session();
+    return !!session && session.role !== 'viewer';
+  }
+
+  #session(): Promise<Session | undefined> {
+    return get<Session>('/v1/session').catch(() => undefined);
   }
 }
 

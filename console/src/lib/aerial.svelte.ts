@@ -26,11 +26,12 @@ export async function readAerial(files: File[]): Promise<AerialFile> {
   if (/\.tiff?$/i.test(picture.name)) {
     const { readGeoTiff } = await import('./geotiff');
     const { picture: shown, place } = await readGeoTiff(picture);
-    const affine = stated ?? place?.affine;
-    return { picture: shown, corners: place && affine ? cornersOf(affine, place.width_px, place.height_px) : undefined };
+    return { picture: shown, corners: place && cornersOf(stated ?? place.affine, place.width_px, place.height_px, place.toPosition) };
   }
+  if (!stated) return { picture, corners: undefined };
+  const { guessedSystem } = await import('./projection');
   const { width, height } = await createImageBitmap(picture);
-  return { picture, corners: stated && cornersOf(stated, width, height) };
+  return { picture, corners: cornersOf(stated, width, height, guessedSystem(stated.e, stated.f)) };
 }
 
 class Aerial {

@@ -2,7 +2,7 @@
 import type * as L from 'leaflet';
 import type { Pixel } from './draw';
 import type { Corners } from './georeference';
-import type { Position } from './types';
+import { Handles } from './handles';
 
 /** The transformation of CSS that puts a rectangle's corners onto four points, in the order of [`Corners`]. */
 export function matrixOf(width_px: number, height_px: number, [p0, p1, p2, p3]: [Pixel, Pixel, Pixel, Pixel]): string {
@@ -24,16 +24,15 @@ export function matrixOf(width_px: number, height_px: number, [p0, p1, p2, p3]: 
 }
 
 export class AerialLayer {
-  readonly #leaflet: typeof L;
   readonly #map: L.Map;
   readonly #image = document.createElement('img');
-  readonly #handles: L.Marker[] = [];
+  readonly #handles: Handles;
   readonly #place = (): void => this.#stretch();
   #corners: Corners | undefined;
 
   constructor(leaflet: typeof L, map: L.Map) {
-    this.#leaflet = leaflet;
     this.#map = map;
+    this.#handles = new Handles(leaflet, map);
     this.#image.className = 'aerial';
     this.#image.alt = '';
     this.#image.addEventListener('load', this.#place);
@@ -47,28 +46,18 @@ export class AerialLayer {
     this.#image.hidden = !corners;
     this.#corners = corners;
     this.#stretch();
-    corners?.forEach((corner, at) => this.#handles[at]?.setLatLng([corner.latitude_deg, corner.longitude_deg]));
   }
 
   /** Shows a handle at each corner; `onmove` gets the corners while one is dragged, and when it is let go. */
   adjust(labels: readonly string[], onmove: (corners: Corners, isDone: boolean) => void): void {
-    this.settle();
-    const icon = this.#leaflet.divIcon({ className: 'aerial-handle', iconSize: [22, 22] });
-    this.#corners?.forEach((corner, at) => {
-      const at_corner: L.LatLngTuple = [corner.latitude_deg, corner.longitude_deg];
-      const handle = this.#leaflet.marker(at_corner, { icon, draggable: true, title: labels[at]!, alt: labels[at]!, autoPan: true });
-      const moved = (isDone: boolean) => (): void => {
-        const { lng: longitude_deg, lat: latitude_deg } = handle.getLatLng();
-        onmove(this.#corners!.map((old, index): Position => (index === at ? { longitude_deg, latitude_deg } : old)) as Corners, isDone);
-      };
-      handle.on('drag', moved(false)).on('dragend', moved(true)).addTo(this.#map);
-      this.#handles.push(handle);
+    this.#handles.show(this.#corners ?? [], labels, (at, position, isDone) => {
+      onmove(this.#corners!.map((old, index) => (index === at ? position : old)) as Corners, isDone);
     });
   }
 
   /** Removes the handles. */
   settle(): void {
-    this.#handles.splice(0).forEach((handle) => handle.remove());
+    this.#handles.clear();
   }
 
   close(): void {

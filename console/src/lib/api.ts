@@ -1,7 +1,7 @@
 // The client of the public REST interface. Every refusal is a problem by RFC 9457.
 import { connection, session } from './connection.svelte';
 import { t } from './i18n.svelte';
-import type { Page, RejectedRow } from './types';
+import type { Page } from './types';
 
 export class ApiProblem extends Error {
   readonly status: number;
@@ -142,14 +142,6 @@ export function cameraPath(camera: string, ...rest: string[]): string {
 /** A path below a site. */
 export function sitePath(site: string, ...rest: string[]): string {
   return ['/v1/sites', ...[site, ...rest].map(encodeURIComponent)].join('/');
-}
-
-/** Rejected rows as a file that a spreadsheet opens. */
-export function rejectedRowsCsv(rows: RejectedRow[]): string {
-  // A spreadsheet would run a cell that begins like a formula.
-  const cell = (text: string): string => `"${(/^[=+\-@\t\r]/.test(text) ? `'${text}` : text).replaceAll('"', '""')}"`;
-  const lines = rows.map((row) => [row.part ?? '', String(row.line), row.field, row.reason].map(cell).join(','));
-  return ['part,line,field,reason', ...lines].join('\r\n') + '\r\n';
 }
 
 export function download(name: string, content: Blob | string, type = 'text/csv'): void {

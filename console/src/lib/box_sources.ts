@@ -1,6 +1,6 @@
 // Where the boxes of a new camera come from: what each source asks for, and its parts of the requests.
-import { slugOf } from './format';
 import type { JsonMapping } from './json_mapping';
+import { slugOf } from './slug';
 import type { TextKey } from './texts';
 
 export interface BoxSource {

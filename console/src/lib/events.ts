@@ -16,8 +16,10 @@ export function listen(path: string, handlers: EventHandlers): () => void {
   let closed = false;
 
   function open(): void {
-    // Behind the last event that was seen: a new source does not send its id by itself.
-    source = new EventSource(lastEventId ? `${path}?last_event_id=${encodeURIComponent(lastEventId)}` : path);
+    // After the last event that was seen: a new source does not send its id by itself.
+    const url = new URL(path, location.origin);
+    if (lastEventId) url.searchParams.set('last_event_id', lastEventId);
+    source = new EventSource(url);
     source.onopen = () => {
       pause_ms = 500;
       connection.regain();

@@ -38,6 +38,16 @@ export function distance_m(a: Position, b: Position): number {
   return Math.hypot(east_m, north_m);
 }
 
+/** A click is at a target within this distance. */
+export const PICK_PX = 20;
+
+/** The item that is nearest to a position, if one is within a distance. */
+export function nearestWithin<T extends { position: Position }>(items: T[], position: Position, most_m: number): T | undefined {
+  const distances = items.map((item) => distance_m(position, item.position));
+  const least_m = Math.min(...distances);
+  return least_m < most_m ? items[distances.indexOf(least_m)] : undefined;
+}
+
 export interface Bounds {
   west: number;
   south: number;
@@ -73,6 +83,29 @@ export function centroid(positions: Position[]): Position | undefined {
     longitude_deg: sum.longitude_deg / positions.length,
     latitude_deg: sum.latitude_deg / positions.length,
   };
+}
+
+/** True if a position is inside a ring, by the number of sides to its east. */
+export function isInside(ring: Position[], { longitude_deg: x, latitude_deg: y }: Position): boolean {
+  let isInside = false;
+  ring.forEach((a, at) => {
+    const b = ring[(at + 1) % ring.length]!;
+    if (a.latitude_deg > y === b.latitude_deg > y) return;
+    if (x < a.longitude_deg + ((y - a.latitude_deg) / (b.latitude_deg - a.latitude_deg)) * (b.longitude_deg - a.longitude_deg)) isInside = !isInside;
+  });
+  return isInside;
+}
+
+/** Distance of a position from a line, m. */
+export function distanceToLine_m(line: Position[], position: Position): number {
+  let least_m = Infinity;
+  for (let at = 1; at < line.length; at++) {
+    const [a, b] = [toPlane(position, line[at - 1]!), toPlane(position, line[at]!)];
+    const [east, north] = [b.east_m - a.east_m, b.north_m - a.north_m];
+    const along = Math.min(Math.max(-(a.east_m * east + a.north_m * north) / (east * east + north * north || 1), 0), 1);
+    least_m = Math.min(least_m, Math.hypot(a.east_m + along * east, a.north_m + along * north));
+  }
+  return least_m;
 }
 
 /** The largest of 1, 2, 5 times a power of ten that is at most `most`. */

@@ -1,17 +1,15 @@
 // The picture and the place of a georeferenced TIFF.
 import { fromBlob } from 'geotiff';
-import type { Affine } from './georeference';
+import type { Affine, ToPosition } from './georeference';
+import { systemOf } from './projection';
 
-/** EPSG codes of degrees of longitude and latitude (WGS 84, ETRS89), and of the web's Mercator projection. */
-const DEGREES = [4326, 4258];
-const MERCATOR = [3857, 3785];
 /** Longer side of the picture that is shown. */
 const LONGEST_SIDE_PX = 4096;
 
 export interface PlacedPicture {
   picture: Blob;
-  /** From the whole image to coordinates, with its size; undefined if it is in another coordinate system or in none. */
-  place?: { affine: Affine; width_px: number; height_px: number };
+  /** From the whole image to coordinates, with its size, and from those to positions; undefined if it is in another system or in none. */
+  place?: { affine: Affine; width_px: number; height_px: number; toPosition: ToPosition };
 }
 
 export async function readGeoTiff(file: Blob): Promise<PlacedPicture> {
@@ -21,9 +19,9 @@ export async function readGeoTiff(file: Blob): Promise<PlacedPicture> {
   const [width, height] = [Math.round(width_px * scale), Math.round(height_px * scale)];
   const picture = await pictureOf(await image.readRGB({ width, height, interleave: true }), width, height);
   const keys = image.getGeoKeys();
-  const isKnown = [...DEGREES, ...MERCATOR].includes(Number(keys?.ProjectedCSTypeGeoKey ?? keys?.GeographicTypeGeoKey));
-  const affine = isKnown ? affineOf(image) : undefined;
-  return affine ? { picture, place: { affine, width_px, height_px } } : { picture };
+  const toPosition = systemOf(Number(keys?.ProjectedCSTypeGeoKey ?? keys?.GeographicTypeGeoKey));
+  const affine = affineOf(image);
+  return affine && toPosition ? { picture, place: { affine, width_px, height_px, toPosition } } : { picture };
 }
 
 type Image = Awaited<ReturnType<Awaited<ReturnType<typeof fromBlob>>['getImage']>>;

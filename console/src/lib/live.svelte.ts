@@ -12,6 +12,8 @@ const FORGET_AFTER_MS = 60_000;
 /** Flags are shown for this long after their last observation. */
 export const FLAG_SHOWN_MS = 4_000;
 
+const BY_NUMBER = new Intl.Collator(undefined, { numeric: true });
+
 export interface LiveTarget {
   id: string;
   position: Position;
@@ -110,7 +112,7 @@ export class Live {
   #publish(): void {
     cancelAnimationFrame(this.#frame);
     this.#frame = requestAnimationFrame(() => {
-      this.targets = [...this.#targets.values()].sort((a, b) => a.id.localeCompare(b.id, undefined, { numeric: true }));
+      this.targets = [...this.#targets.values()].sort((a, b) => BY_NUMBER.compare(a.id, b.id));
     });
   }
 }

@@ -1,7 +1,7 @@
 // Applications of phones that send their position, and what is set in each (docs/howto/integrations.md, "Receivers: phones").
 import { getAll, post } from './api';
-import { slugOf } from './format';
 import { t } from './i18n.svelte';
+import { slugOf } from './slug';
 import type { TextKey } from './texts';
 import type { Connection } from './types';
 

@@ -46,6 +46,12 @@ export interface SnapshotSource {
   url: string;
   username?: string;
 }
+/** How finished tracks are kept. */
+export interface HistorySettings {
+  keep_days: number;
+  max_bytes: number;
+  coarsen_m: number;
+}
 export interface Camera {
   id: string;
   display_name: string;
@@ -58,6 +64,7 @@ export interface Camera {
   /** Whose world tracks the camera contributes to. */
   site?: string;
   snapshot?: SnapshotSource;
+  history?: HistorySettings;
   retrain_when_moved: boolean;
   learn_automatically: boolean;
   revision: number;
@@ -250,6 +257,11 @@ export interface Motion {
   course_interval_deg?: [number, number];
   stationary_probability: number;
 }
+/** The receiver that a target carries, as association found it. */
+export interface ReceiverMatch {
+  receiver_id: string;
+  probability: number;
+}
 export interface TrackFeature {
   geometry: { coordinates: [number, number] };
   properties: Motion & {
@@ -262,6 +274,7 @@ export interface TrackFeature {
     nis?: number;
     rejections: { source: string; reason: string; nis?: number }[];
     restarted: boolean;
+    receiver_match?: ReceiverMatch | null;
   };
 }
 export interface TrackUpdate extends TrackFeature {
@@ -421,6 +434,8 @@ export interface Site {
   id: string;
   display_name: string;
   cameras: number;
+  history?: HistorySettings;
+  revision: number;
 }
 /** A target of a site, over all of its cameras. */
 export interface WorldTrack extends Motion {
@@ -428,14 +443,114 @@ export interface WorldTrack extends Motion {
   /** Once a receiver is known. */
   target_id?: string;
   time: string;
+  started_at: string;
   velocity_east_m_s: number;
   velocity_north_m_s: number;
   covariance: Covariance;
   r95_m: number;
   sightings: { camera_id: string; tracker_id?: string; last_seen_at: string }[];
+  receiver_match?: ReceiverMatch | null;
   position: Position;
 }
 export interface WorldTrackFeature {
   geometry: { coordinates: [number, number] };
   properties: Omit<WorldTrack, 'position'>;
+}
+/** A geometry of GeoJSON that a place can have. */
+export type PlaceGeometry =
+  | { type: 'Polygon'; coordinates: [number, number][][] }
+  | { type: 'LineString'; coordinates: [number, number][] }
+  | { type: 'Point'; coordinates: [number, number] };
+export type EventKind =
+  | 'enter'
+  | 'leave'
+  | 'dwell'
+  | 'cross'
+  | 'wrong_way'
+  | 'speed_above'
+  | 'speed_below'
+  | 'appeared'
+  | 'lost'
+  | 'near'
+  | 'receiver_without_box'
+  | 'box_without_receiver';
+/** Which events are made of what happens at a place. */
+export interface PlaceRule {
+  id: string;
+  kind: EventKind;
+  classes?: string[];
+  after_s?: number;
+  speed_mps?: number;
+  distance_m?: number;
+  probability?: number;
+}
+/** An area or a line on the ground. */
+export interface Place {
+  id: string;
+  site_id?: string;
+  camera_id?: string;
+  display_name: string;
+  labels: Record<string, string>;
+  geometry: PlaceGeometry;
+  radius_m?: number;
+  probability: number;
+  rules: PlaceRule[];
+  revision: number;
+}
+export interface PlaceEvent extends Position {
+  /** The same whenever the event is delivered again. */
+  id: string;
+  kind: EventKind;
+  place_id: string;
+  rule_id: string;
+  time: string;
+  time_sigma_s: number;
+  probability: number;
+  track_id: string;
+  target_id?: string;
+  class?: string;
+  speed_mps: number;
+  speed_sigma_mps: number;
+  direction?: 'left_to_right' | 'right_to_left';
+  dwell_s?: number;
+  other_track_id?: string;
+  distance_m?: number;
+  distance_sigma_m?: number;
+}
+/** A number of things; the interval holds the true number with 95 % probability. */
+export interface CountFigure {
+  count: number;
+  expected: number;
+  interval: [number, number];
+}
+export interface Quantile {
+  percent: number;
+  value: number;
+  interval: [number, number];
+}
+export interface PlaceFigures {
+  enters: CountFigure;
+  leaves: CountFigure;
+  left_to_right: CountFigure;
+  right_to_left: CountFigure;
+  mean_occupancy: number;
+  dwell_s: Quantile[];
+  speed_mps: Quantile[];
+  /** Crossings of a line by the line that the target crossed before. */
+  origins: Record<string, number>;
+}
+export interface PlaceStatistics {
+  occupancy: CountFigure;
+  total: PlaceFigures;
+  /** Those in which something was counted, oldest first. */
+  intervals: (PlaceFigures & { from: string })[];
+}
+/** A position of a finished track. */
+export interface HistoryPosition extends Motion {
+  time: string;
+  track_id: string;
+  target_id?: string;
+  class?: string;
+  position: Position;
+  covariance: Covariance;
 }

@@ -1,0 +1,2 @@
+function e(e){let t=e=>typeof e==`number`?String(e):`"${(/^[=+\-@\t\r]/.test(e)?`'${e}`:e).replaceAll(`"`,`""`)}"`;return e.map(e=>`${e.map(t).join(`,`)}\r\n`).join(``)}function t(t){return`part,line,field,reason\r
+`+e(t.map(e=>[e.part??``,String(e.line),e.field,e.reason]))}export{t as n,e as t};

@@ -1,0 +1,1 @@
+function e(e,{kind:t,id:n},r={}){let i=new URLSearchParams({[t]:n});for(let[e,t]of Object.entries(r))t&&i.set(e,t);return`${e}?${i}`}export{e as t};

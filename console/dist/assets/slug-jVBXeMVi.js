@@ -1,0 +1,1 @@
+function e(e){return e.toLowerCase().normalize(`NFKD`).replace(/[^a-z0-9]+/g,`-`).slice(0,63).replace(/^-+|-+$/g,``)}export{e as t};

@@ -28,7 +28,7 @@ from sightfix import (
     UnauthenticatedError,
     WaitTimeoutError,
 )
-from sightfix.models import SiteTrainingRun, TrackUpdate, TrainingRun
+from sightfix.models import GeometryLineString, Rule, SiteTrainingRun, TrackUpdate, TrainingRun
 from tests.conftest import ServerProcess, admin_key
 
 NOON = datetime(2026, 1, 1, 12, tzinfo=UTC)
@@ -255,6 +255,36 @@ def test_a_site_tracks_targets_over_its_cameras(trained: ServerProcess) -> None:
         client.sites.delete("harbour")
         with pytest.raises(NotFoundError):
             client.sites.get("harbour")
+
+
+def test_a_place_reports_who_crosses_it(client: Client) -> None:
+    client.cameras.create(id="gate")
+    line = GeometryLineString(type="LineString", coordinates=[[24.745, 59.4365], [24.745, 59.4375]])
+    rules = [Rule(id="over", kind="cross")]
+    place = client.places.create(id="line", camera_id="gate", geometry=line, rules=rules)
+    assert (place.geometry, place.probability, place.rules) == (line, 0.95, rules)
+    changed = client.places.update("line", revision=place.revision, display_name="Line")
+    assert [it.display_name for it in client.places.list(camera="gate")] == [changed.display_name] == ["Line"]
+    with pytest.raises(InvalidRequestError):
+        client.places.update("line", radius_m=3.0)
+    start = datetime.now(UTC) - timedelta(minutes=2)
+    drives = 0
+    # A place is evaluated within a second or two after it was changed.
+    while not (events := list(client.places.events(place="line"))):
+        drives += 1
+        for step in range(30):
+            fix = Fix(longitude_deg=24.7435 + 0.0001 * step, latitude_deg=59.437, sigma_m=0.5)
+            time = start + timedelta(seconds=step)
+            client.tracks.follow("gate", [Observation(time=time, target_id=f"car-{drives}", fix=fix)])
+    assert (events[0].kind, events[0].direction, events[0].camera_id) == ("cross", "left_to_right", "gate")
+    assert abs(events[0].time - start - timedelta(seconds=15)) < timedelta(seconds=1)
+    watched = next(client.places.watch(kind="cross", resume_after="0"))
+    assert watched.event == events[0]
+    counted = client.places.statistics("line", interval="hour", from_=start - timedelta(hours=1))
+    assert counted.total.left_to_right.count >= 1
+    client.places.delete("line")
+    with pytest.raises(NotFoundError):
+        client.places.get("line")
 
 
 def site_with_samples(client: Client, files: dict[str, Path]) -> None:

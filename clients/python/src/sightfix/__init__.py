@@ -24,7 +24,7 @@ from sightfix._errors import (
     UnavailableError,
     WaitTimeoutError,
 )
-from sightfix._events import CameraEvent, LostEvents, SiteEvent
+from sightfix._events import CameraEvent, LostEvents, PlaceEventMessage, SiteEvent
 from sightfix._items import LiveItem
 from sightfix._layout import CsvLayout
 from sightfix._request import RetryPolicy
@@ -52,6 +52,7 @@ __all__ = [
     "NotFoundError",
     "Observation",
     "PermissionDeniedError",
+    "PlaceEventMessage",
     "Position",
     "Problem",
     "ProblemError",

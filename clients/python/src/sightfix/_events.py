@@ -1,10 +1,18 @@
-"""Server-sent events of cameras and sites."""
+"""Server-sent events of cameras, sites and places."""
 
 from dataclasses import dataclass
 from typing import Any
 
 from sightfix._json import from_json
-from sightfix.models import CameraMoved, LostSiteEventCount, SeenBox, TrackChange, TrackUpdate, WorldTrackFeature
+from sightfix.models import (
+    CameraMoved,
+    LostSiteEventCount,
+    PlaceEvent,
+    SeenBox,
+    TrackChange,
+    TrackUpdate,
+    WorldTrackFeature,
+)
 
 
 @dataclass(frozen=True)
@@ -25,6 +33,16 @@ class SiteEvent:
     """`track`, `track_started`, `handed_over`, `identified`, `merged`, `track_ended` or `lost`."""
     body: WorldTrackFeature | TrackChange | LostSiteEventCount
     """A position (`track`), lost events (`lost`), or a change of tracks."""
+
+
+@dataclass(frozen=True)
+class PlaceEventMessage:
+    """An event of a place, as it is read from the stream."""
+
+    id: str
+    """The id to resume after; that of the event itself is `event.id`."""
+    event: PlaceEvent
+    """The event."""
 
 
 CameraEvent = TrackUpdate | SeenBox | CameraMoved | LostEvents

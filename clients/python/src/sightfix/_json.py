@@ -99,11 +99,18 @@ def dataclass_decoder(kind: Any) -> Decoder:
     return lambda value: kind(**{name: decode(value[key]) for key, name, decode in names if key in value})
 
 
+def tagged_decoder(kinds: list[Any]) -> Decoder:
+    """The decoder of objects, each of which has another constant in its field `type`."""
+    tags = ((kind, get_type_hints(kind).get("type")) for kind in kinds)
+    by_tag = {get_args(tag)[0]: decoder(kind) for kind, tag in tags if tag is not None}
+    return lambda value: by_tag[value["type"]](value)
+
+
 def union_decoder(members: tuple[Any, ...]) -> Decoder:
-    """The decoder of an optional value, or of a union of an object and plain values."""
+    """The decoder of an optional value, or of a union of plain values and objects; `type` tells objects apart."""
     objects = [member for member in members if dataclasses.is_dataclass(member)]
     others = [member for member in members if member is not NoneType and member not in objects]
-    decode_object = decoder(objects[0]) if objects else None
+    decode_object = tagged_decoder(objects) if len(objects) > 1 else decoder(objects[0]) if objects else None
     decode_other = decoder(others[0]) if others else None
 
     def decode(value: Any) -> Any:

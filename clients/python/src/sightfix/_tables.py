@@ -5,7 +5,7 @@ The columns are those of a CSV file of samples; in tables of this package their 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -75,7 +75,7 @@ def is_missing(value: Any) -> bool:
 def observation_rows(table: Table) -> Iterator[dict[str, Any]]:
     """The rows of a table as JSON values of observations. Columns that only samples have are left out."""
     for row in table_rows(table):
-        yield grouped(row, ("time", "target_id"))
+        yield grouped(row, ("time", "target_id", "class"))
 
 
 def live_items(table: Table) -> Iterator[LiveItem]:
@@ -170,7 +170,7 @@ def fusion_columns(fusions: list[FusedFix]) -> dict[str, list[Any]]:
     }
 
 
-TEXTS = ("target_id", "class", "position_flags")
+TEXTS = ("target_id", "class", "position_flags", "camera_id", "site_id", "track_id")
 
 
 def to_arrays(columns: Mapping[str, list[Any]]) -> dict[str, np.ndarray[Any, Any]]:
@@ -200,3 +200,48 @@ def to_frame(columns: Mapping[str, list[Any]], index: Any = None) -> pd.DataFram
     frame = pd.DataFrame(to_arrays(columns), index=index)
     frame["time"] = frame["time"].dt.tz_localize("UTC")
     return frame
+
+
+HISTORY_NAMES = ("camera_id", "site_id", "track_id", "target_id", "class")
+ACCELERATION = (
+    "east_mps2",
+    "north_mps2",
+    "covariance_east_m2_s4",
+    "covariance_north_m2_s4",
+    "covariance_east_north_m2_s4",
+)
+INTERVALS = ("speed_interval_mps", "course_interval_deg")
+
+
+def history_columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Positions of finished tracks, as JSON has them, by column."""
+    low_and_high = {
+        f"{name}_{bound}": [(row.get(name) or (None, None))[at] for row in rows]
+        for name in INTERVALS
+        for at, bound in enumerate(("low", "high"))
+    }
+    return {
+        "time": [datetime.fromisoformat(row["time"]) for row in rows],
+        **{name: [row.get(name) for row in rows] for name in HISTORY_NAMES},
+        "longitude_deg": [row["position"]["longitude_deg"] for row in rows],
+        "latitude_deg": [row["position"]["latitude_deg"] for row in rows],
+        **{f"covariance_{name}": [row["covariance"][name] for row in rows] for name in COVARIANCE},
+        "speed_mps": [row["speed_mps"] for row in rows],
+        "course_deg": [row.get("course_deg") for row in rows],
+        **low_and_high,
+        "stationary_probability": [row["stationary_probability"] for row in rows],
+        **{
+            f"acceleration_{name}": [(row.get("acceleration") or {}).get(name) for row in rows] for name in ACCELERATION
+        },
+    }
+
+
+def to_geo_frame(frame: pd.DataFrame) -> pd.DataFrame:
+    """The frame with its positions as points (WGS 84) if geopandas is installed, else as it is."""
+    try:
+        import geopandas as gpd  # noqa: PLC0415, an optional dependency
+    except ImportError:
+        return frame
+    points = gpd.points_from_xy(frame["longitude_deg"], frame["latitude_deg"])
+    geo_frame: pd.DataFrame = gpd.GeoDataFrame(frame, geometry=points, crs="EPSG:4326")
+    return geo_frame

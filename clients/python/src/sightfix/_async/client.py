@@ -14,8 +14,10 @@ import httpx
 from sightfix._async.cameras import Cameras
 from sightfix._async.evaluations import Evaluations
 from sightfix._async.fusions import Fusions
+from sightfix._async.history import History
 from sightfix._async.keys import Keys
 from sightfix._async.models import Models
+from sightfix._async.places import Places
 from sightfix._async.samples import Samples
 from sightfix._async.site_training_runs import SiteTrainingRuns
 from sightfix._async.sites import Sites
@@ -77,7 +79,9 @@ class AsyncClient:
         self.tracks = Tracks(self._transport)
         self.evaluations = Evaluations(self._transport)
         self.sites = Sites(self._transport)
+        self.places = Places(self._transport)
         self.site_training_runs = SiteTrainingRuns(self._transport)
+        self.history = History(self._transport)
         self.keys = Keys(self._transport)
 
     async def __aenter__(self) -> Self:

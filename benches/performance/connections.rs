@@ -130,6 +130,7 @@ fn encode() {
     let position = OutgoingPosition {
         message_id: "0197f0b2-7c3e-7d2a-9d55-2b9c1f1c2a10",
         camera_id: &camera,
+        receiver_match: None,
         target_id: &target,
         time: "2026-06-01T12:00:20.5Z".parse().expect("a time"),
         position: Position::new(103.986_78, 30.628).expect("a place"),

@@ -26,7 +26,7 @@ impl Served {
         Self::start_with(1).await
     }
 
-    /// Starts with so many training workers.
+    /// Starts with `workers` training workers.
     pub(crate) async fn start_with(workers: usize) -> Self {
         Self::start_limited(workers, Limits::default()).await
     }

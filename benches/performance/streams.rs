@@ -1,6 +1,7 @@
 //! Live streams: throughput against a bare tonic echo of the same messages, and the time to an answer
 //! of many slow streams at once.
 
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
@@ -8,12 +9,14 @@ use std::time::{Duration, Instant};
 
 use futures_util::StreamExt as _;
 use futures_util::stream::{self, BoxStream};
-use sightfix::domain::Observation;
+use sightfix::domain::{Observation, PlaceId, TrackScope};
+use sightfix::geo::{EastNorth, LocalPlane};
 use sightfix::grpc::proto;
 use sightfix::grpc::proto::fusion_service_client::FusionServiceClient;
 use sightfix::grpc::proto::fusion_service_server::{FusionService, FusionServiceServer};
 use sightfix::grpc::proto::stream_request::Kind as Sent;
 use sightfix::grpc::proto::stream_response::Kind as Received;
+use sightfix::places::settings::{EventKind, Geometry, PlaceSettings, Rule};
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, mpsc};
 use tonic::transport::{Channel, Endpoint};
@@ -26,6 +29,8 @@ use crate::tables;
 const IN_FLIGHT: usize = 64;
 /// Items of a round, over all its streams.
 const ITEMS: usize = 64_000;
+/// Places of a camera.
+const PLACES: usize = 100;
 /// The many slow streams.
 const CAMERAS: usize = 200;
 const RATE_HZ: f64 = 25.0;
@@ -154,7 +159,7 @@ async fn open(
     (items, responses)
 }
 
-/// Items per second over so many streams, each with its items in flight.
+/// Items per second over `streams` streams, each with its items in flight.
 async fn throughput(
     address: SocketAddr,
     camera: &str,
@@ -214,7 +219,47 @@ async fn sample_answer(served: &Served, observations: &Arc<Vec<Observation>>) ->
     }
 }
 
-/// Throughput of one stream and of sixteen, then the time to an answer of two hundred.
+/// Squares of 10 m on the ways of the targets, which are entered and left.
+async fn put_places(served: &Served) {
+    let rules = [EventKind::Enter, EventKind::Leave].map(|kind| Rule {
+        id: kind.as_str().to_owned(),
+        kind,
+        classes: Vec::new(),
+        after_s: None,
+        speed_mps: None,
+        distance_m: None,
+        probability: None,
+    });
+    for number in 0..PLACES {
+        let middle = &served.observations[number * served.observations.len() / PLACES];
+        let plane = LocalPlane::new(middle.fix().expect("a fix").position);
+        let corner = |(east_m, north_m): (f64, f64)| {
+            let position = plane.to_position(EastNorth { east_m, north_m });
+            [position.longitude_deg(), position.latitude_deg()]
+        };
+        let ring = [(-5.0, -5.0), (5.0, -5.0), (5.0, 5.0), (-5.0, 5.0), (-5.0, -5.0)].map(corner);
+        let settings = PlaceSettings {
+            display_name: String::new(),
+            labels: BTreeMap::new(),
+            geometry: Geometry::Polygon(vec![ring.to_vec()]),
+            radius_m: None,
+            probability: PlaceSettings::DEFAULT_PROBABILITY,
+            rules: rules.to_vec(),
+        };
+        let id = PlaceId::new(&format!("place-{number}")).expect("a slug");
+        let scope = TrackScope::Camera(served.camera.clone());
+        served.app.places().create(id, scope, &settings).await.expect("a new place");
+    }
+}
+
+fn not_compared(served: &Served) -> f64 {
+    let metrics = served.app.metrics.render();
+    let line =
+        metrics.lines().find_map(|line| line.strip_prefix("sightfix_place_measurements_dropped_total "));
+    line.map_or(0.0, |number| number.parse().expect("a number"))
+}
+
+/// Throughput of one stream and of sixteen, of one among places, then the time to an answer of two hundred.
 pub(crate) fn run() {
     let runtime = runtime();
     let served = runtime.block_on(Served::start());
@@ -233,6 +278,19 @@ pub(crate) fn run() {
         let ratio = in_turn(|| rate(served.address), || rate(echo));
         ratio::row(&format!("{streams} streams"), &ratio);
     }
+    let among_places = runtime.block_on(Served::start());
+    runtime.block_on(put_places(&among_places));
+    ratio::head(
+        &format!("The same with {PLACES} places on the ways of the targets, compared with none"),
+        "items/s",
+    );
+    let rate = |served: &Served| {
+        runtime.block_on(throughput(served.address, served.camera.as_str(), &observations, 1))
+    };
+    ratio::row(&format!("{PLACES} places"), &in_turn(|| rate(&among_places), || rate(&served)));
+    tables::head("Measurements of these tracks", &["", "not compared with places, as too many waited"]);
+    tables::row("of all rounds", &[(not_compared(&among_places), 0)]);
+    among_places.end();
     let mut times_s = runtime.block_on(many(&served, &observations));
     times_s.sort_by(f64::total_cmp);
     let quantile = |share: f64| 1e3 * times_s[((times_s.len() - 1) as f64 * share) as usize];

@@ -182,7 +182,7 @@ def is_ready(url: str) -> bool:
 
 
 def random_roles(nodes: int) -> list[str]:
-    """Roles for so many processes: from three on, one only trains and one only serves."""
+    """Roles of the processes: with three or more, one only trains and one only serves."""
     return ["both"] * nodes if nodes < 3 else ["both"] * (nodes - 2) + ["serve", "train"]
 
 

@@ -66,7 +66,7 @@ class Plant:
     #: Between clients and the balancer, between a sink and its receiver, or as another address of a node.
     place: str
     break_it: "Callable[[Plant, Request, Forward], Answer]"
-    #: Every so many requests that it could touch, it touches one.
+    #: It touches one in this number of the requests that it could touch.
     every: int = EVERY
     #: Answers of before, of plants that need them.
     kept: list[Answer] = dataclasses.field(default_factory=list)

@@ -58,7 +58,7 @@ class Client:
         self._ending = ending
 
     def steps(self, pause_s: float) -> Iterator[int]:
-        """Counts from 1, with pauses of about so many seconds, until the client is to end."""
+        """Counts from 1, with pauses of about `pause_s` seconds, until the client is to end."""
         for step in itertools.count(1):
             if self._ending.wait(self.chance.uniform(0.5, 1.5) * pause_s):
                 return

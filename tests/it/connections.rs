@@ -131,7 +131,7 @@ async fn a_connection_that_only_answers_pings_is_closed() {
     closed.expect("it is closed").expect("in order");
 }
 
-/// A server with a camera and so many samples that no socket holds an export of them.
+/// A server with a camera and more samples than a socket buffers of their export.
 async fn with_samples(settings: &[(&str, &str)]) -> (tempfile::TempDir, TestServer) {
     let folder = data_folder();
     let server = TestServer::start_with(folder.path(), settings);

@@ -91,7 +91,7 @@ async fn browsers_are_told_what_pages_may_do() {
     for path in ["/docs/", "/openapi.json", "/v1/cameras", "/v1/none"] {
         assert_eq!(server.get(path).await.header("x-content-type-options"), "nosniff", "{path}");
     }
-    for path in ["/docs/", "/docs/swagger-ui-bundle.js"] {
+    for path in ["/docs/", "/docs/swagger/swagger-ui-bundle.js"] {
         let page = server.get(path).await.expect(200);
         let policy = page.header("content-security-policy");
         assert!(

@@ -67,7 +67,7 @@ async fn with_camera() -> (tempfile::TempDir, TestServer) {
     (folder, server)
 }
 
-/// Follows a target through so many fixes.
+/// Follows a target through a fix per second.
 async fn follow(server: &TestServer, seconds: std::ops::Range<u32>) {
     for second in seconds {
         let time = format!("2020-12-14T06:{:02}:{:02}Z", second / 60, second % 60);

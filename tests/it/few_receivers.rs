@@ -40,7 +40,7 @@ struct Score {
 }
 
 impl Recording {
-    /// Fits a model with the fixes of so many receivers, chosen by the seed; `None` if they do not suffice.
+    /// Fits a model with the fixes of some receivers, chosen by the seed; `None` if they do not suffice.
     fn score(&self, receivers: usize, seed: u64, with_boxes: bool) -> Option<Score> {
         let mut carriers: Vec<&TargetId> = self.samples.keys().collect();
         carriers.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));

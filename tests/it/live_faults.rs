@@ -322,12 +322,12 @@ async fn a_wall_clock_that_jumps_back_keeps_no_target_out() {
     let app = server.app();
     let id = CameraId::new("yard").expect("a slug");
     app.cameras().create(NewCamera::named(id.clone())).await.expect("a new camera");
-    let (camera, lease) = app.own_camera(&id).await.expect("known");
+    let (camera, lease) = app.nodes().own_camera(&id).await.expect("known");
     let follow = |name: &str| {
         let time = Timestamp::from_second(wall_s.load(Ordering::SeqCst)).expect("in range");
         let target_id = Some(TargetId::new(name).expect("a name"));
         let fix = Fix { position: at(8.0, 47.0), sigma_m: None };
-        app.follow((&camera, &lease), Observation::with_fix(time, target_id, None, fix))
+        app.live().follow((&camera, &lease), Observation::with_fix(time, target_id, None, fix))
     };
     for name in ["a", "b", "c", "d"] {
         follow(name).expect("followed");
@@ -335,9 +335,9 @@ async fn a_wall_clock_that_jumps_back_keeps_no_target_out() {
     assert_eq!(follow("e").expect_err("no room").kind(), ErrorKind::Overloaded);
     wall_s.fetch_sub(3_600, Ordering::SeqCst);
     monotonic_s.fetch_add(61, Ordering::SeqCst);
-    assert!(app.tracks(&id).await.expect("tracks").is_empty(), "expired by the monotonic clock");
+    assert!(app.live().tracks(&id).await.expect("tracks").is_empty(), "expired by the monotonic clock");
     follow("e").expect("there is room");
-    assert_eq!(app.tracks(&id).await.expect("tracks").len(), 1);
+    assert_eq!(app.live().tracks(&id).await.expect("tracks").len(), 1);
 }
 
 #[tokio::test]

@@ -36,7 +36,7 @@ fn fix() -> Value {
 
 type SlowBody = http_body_util::combinators::BoxBody<Bytes, Infallible>;
 
-/// An HTTP/2 connection with so many uploads that have sent one byte and send no other. Gives back
+/// An HTTP/2 connection with `uploads` uploads that have sent one byte and send no other. Gives back
 /// the task that holds it open.
 async fn slow_uploads(server: SocketAddr, uploads: usize) -> JoinSet<()> {
     let stream = TokioIo::new(connect_from(GREEDY, server).await);

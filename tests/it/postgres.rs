@@ -26,7 +26,7 @@ async fn with_samples(server: &TestServer) {
     server.send("POST", "/v1/cameras/c/samples", &headers, simulated_csv()).await.expect(200);
 }
 
-/// Samples a second apart, of which the last is so many days old.
+/// Samples a second apart; the last is `days` days old.
 fn csv(count: i64, days: i64) -> String {
     let mut csv = "time,target_id,left,top,width,height,longitude,latitude\n".to_owned();
     for second in 0..count {
@@ -65,7 +65,7 @@ async fn the_wrong_clock_of_one_node_deletes_no_samples() {
     config.listen.set_port(0);
     config.limits.sample_days = 30;
     let wrong = Server::bind(config, ahead, Randomness::seeded(1)).await.expect("a free port");
-    let deleted = wrong.app().retain_samples().await.expect("deleted");
+    let deleted = wrong.app().samples().retain().await.expect("deleted");
     assert_eq!(deleted, Retention::Deleted(40), "those that are older by the right clock");
     let count = right.get("/v1/cameras/c/samples/count").await.expect(200).json();
     assert_eq!(count["count"], 500);

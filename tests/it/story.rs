@@ -185,6 +185,10 @@ async fn the_demonstration_prints_requests_that_work() {
     while position().await == first {
         tokio::time::sleep(std::time::Duration::from_millis(50)).await;
     }
+    // Its display is told who enters the quay.
+    while server.get("/v1/connections/demo-display").await.expect(200).json()["status"]["messages"] == 0 {
+        tokio::time::sleep(std::time::Duration::from_millis(500)).await;
+    }
 }
 
 /// A model file of an earlier format loads, and is more accurate than the receiver alone.

@@ -295,7 +295,7 @@ async fn a_server_that_ends_asks_to_reconnect_and_acknowledges_what_it_stored() 
     assert!(ended.await.expect("no panic"), "the server ends well");
 }
 
-/// Waits until so many items were taken.
+/// Waits until that number of items was taken.
 async fn taken(server: &TestServer, count: usize) {
     let begun = Instant::now();
     let wanted = format!("sightfix_live_items_total {count}\n");

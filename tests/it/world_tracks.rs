@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::harness::{data_folder, run, shared, sightfix};
 
@@ -107,6 +107,21 @@ fn shared_plaza_is_tracked_over_three_cameras() {
     assert!(figure(oracle, "mota") - figure(together, "mota") <= 0.03, "{oracle}");
     assert!(figure(oracle, "idf1") - figure(together, "idf1") <= 0.03, "{oracle}");
     assert!(figure(degraded, "identity_f1_by_boxes") >= 0.9, "{degraded}");
+    let counts = together["counts"].as_array().expect("counts");
+    let of_lines = |pointer: &str| -> u64 {
+        let lines = counts.iter().filter(|it| it["place"] != "middle");
+        lines.filter_map(|it| it.pointer(pointer)?.as_u64()).sum()
+    };
+    let crossings = [of_lines("/truth"), of_lines("/tracked/count")];
+    assert_eq!(
+        json!(crossings),
+        json!([together["crossings"]["true_crossings"], together["crossings"]["reported"]])
+    );
+    assert!(crossings[1] * 10 >= crossings[0] * 6, "{counts:?}");
+    assert!(
+        counts.iter().any(|it| it["counted"] == "enters" && it["truth"].as_u64() > Some(100)),
+        "{counts:?}"
+    );
     let redrawn = evaluate(&plaza, "1920x1080", &["--redraws", "20"]);
     // The goals are 0.97, 0.92 and at most 0.02 less than by true identities (docs/explanation/world-tracks.md).
     assert!(figure(&redrawn[0], "identity_f1_by_boxes") >= 0.965, "{}", redrawn[0]);
@@ -117,4 +132,13 @@ fn shared_plaza_is_tracked_over_three_cameras() {
     for alone in &redrawn[5..] {
         assert!(figure(alone, "mean_error_by_all_m") < figure(alone, "mean_error_m"), "{alone}");
     }
+    // Phones beside the boxes take no identity away.
+    let drawn = evaluate(&plaza, "1920x1080", &["--draws", "1", "--first-draw", "601"]);
+    let [.., without, with] = &drawn[..] else { panic!("{drawn:?}") };
+    assert!(
+        figure(with, "identity_f1_by_boxes") >= figure(without, "identity_f1_by_boxes") - 0.01,
+        "{with} {without}"
+    );
+    let named = |figure: &str| with["named"][figure].as_u64().expect("a number");
+    assert!(named("named") > 100 && named("right") * 10 >= named("named") * 9, "{with}");
 }

@@ -36,7 +36,7 @@ fn streaming(
     (feeding, go_on)
 }
 
-/// Until so many samples of the camera are stored.
+/// Waits until that number of samples is stored.
 async fn until_stored(folder: &Path, samples: i64) {
     loop {
         let stored: i64 = sql(folder, "SELECT count(*) FROM samples").parse().expect("a number");

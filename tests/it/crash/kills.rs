@@ -23,7 +23,7 @@ pub(super) const WRITE: &str = "pwrite64";
 pub(super) const FLUSH: &str = "fsync,fdatasync";
 /// A server that reached no such call is killed after this time.
 const LONGEST_LIFE: Duration = Duration::from_secs(3);
-/// Every so many moments are those of a database that is being created.
+/// One in this number of moments is within the creation of the database.
 const CREATION_EVERY: u64 = 6;
 
 /// How a server ends.

@@ -24,6 +24,11 @@ fn yard() -> proto::CameraProfile {
             username: Some("viewer".to_owned()),
             password: None,
         }),
+        history: Some(proto::HistorySettings {
+            keep_days: Some(7),
+            max_bytes: Some(5_000_000),
+            coarsen_m: 2.5,
+        }),
     }
 }
 

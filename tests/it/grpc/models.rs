@@ -91,7 +91,7 @@ async fn fuses_as_the_application_does(server: &Server) {
     let request = proto::FuseRequest { camera_id: "yard".to_owned(), observations: messages };
     let fusions = server.fusion().fuse(request).await.expect("positions").into_inner().fusions;
     let active = server.app.active_camera(&camera).await.expect("known");
-    let expected = server.app.fuse_batch(active, &observations).await.expect("positions");
+    let expected = server.app.fusion().fuse(active, &observations).await.expect("positions");
     assert_eq!(fusions.len(), expected.len());
     for (fused, expected) in fusions.iter().zip(&expected) {
         let position = fused.fused.expect("set");

@@ -72,7 +72,7 @@ proptest! {
     ) {
         let observation = wire::Observation {
             time: "2026-01-01T00:00:00Z".into(), target_id: None, receiver_id: None, tracker_id: None, bounding_box,
-            fix,
+            fix, class: None,
         };
         let bounds = TimeBounds::at("2026-06-01T00:00:00Z".parse().expect("an instant"));
         if let Ok(observation) = observation.to_domain(&bounds, None, &Receivers::default()) {

@@ -19,8 +19,8 @@ const LEARNT_FROM_S: f64 = 600.0;
 const LEARNT_BY_S: f64 = 1_200.0;
 /// Time for which positions are looked at, s.
 const LIVE_S: f64 = 120.0;
-/// Positions of the phone that are looked at: its fixes of the time after give more.
-const RECEIVED: u32 = 100;
+/// Positions that are looked at, of all eleven targets and of the fixes.
+const RECEIVED: u32 = 900;
 /// Time of messages that are published at once, s.
 const SLICE_S: f64 = 20.0;
 /// Image size of the square's camera, px.
@@ -277,7 +277,7 @@ async fn learns_by_itself_whose_phone_it_sees(detector: Detector) {
     assert!(all > 200 && right * 100 >= all * 95, "{right} of {all}");
 
     // From now on boxes are matched as they come, and positions go out.
-    let topic = format!("sightfix/{}/phone-0", square.camera);
+    let topic = format!("sightfix/{}/+", square.camera);
     broker.subscribe(&topic);
     let sink = json!({"id": "positions", "sink": {
         "address": broker.address(), "camera_ids": [square.camera], "min_interval_s": 0,
@@ -289,6 +289,9 @@ async fn learns_by_itself_whose_phone_it_sees(detector: Detector) {
     let times: Vec<Timestamp> = received
         .lines()
         .filter_map(|line| serde_json::from_str::<Value>(line.split_once(' ')?.1).ok())
+        .filter(|message| {
+            message["target_id"] == "phone-0" || message["receiver_match"]["receiver_id"] == "phone-0"
+        })
         .map(|message| message["time"].as_str().expect("a time").parse().expect("a time"))
         .collect();
     // Fixes have times of their own, between the frames.

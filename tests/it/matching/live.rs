@@ -137,16 +137,18 @@ struct Answered {
 impl Answered {
     fn add(&mut self, row: &Row, answer: &proto::StreamAnswer) {
         let target = answer.track.as_ref().map(|track| track.target_id.as_str());
+        if row.walker.is_some() {
+            // Whatever it carries, the target is the tracker's.
+            assert_eq!(target, Some(format!("tracker:{}", row.id).as_str()), "{answer:?}");
+        }
         match (&answer.receiver_match, row.walker) {
             (Some(found), Some(walker)) => {
-                assert!(found.probability >= 0.6 && target == Some(found.receiver_id.as_str()), "{answer:?}");
+                let of_track = answer.track.as_ref().and_then(|track| track.receiver_match.as_ref());
+                assert!(found.probability >= 0.6 && of_track == Some(found), "{answer:?}");
                 let is_right = found.receiver_id == format!("phone-{walker}");
                 *if is_right { &mut self.right } else { &mut self.wrong } += 1;
             }
-            (None, Some(_)) => {
-                assert_eq!(target, Some(format!("tracker:{}", row.id).as_str()), "{answer:?}");
-                self.unmatched += 1;
-            }
+            (None, Some(_)) => self.unmatched += 1,
             (found, None) => assert!(found.is_none(), "{answer:?}"),
         }
     }
@@ -187,6 +189,38 @@ async fn boxes_of_a_stream_are_matched_with_the_receivers_beside_them() {
     let stored = exported_csv(&server).await;
     let live = stored.lines().skip(1).filter(|line| !line.contains(",w"));
     assert!(live.clone().count() > 20 && live.clone().all(|line| line.contains(",phone-")), "{stored}");
+}
+
+/// In a site world tracks are matched: a carrier's track has its receiver as an attribute, and the id that it had before.
+#[tokio::test]
+async fn a_world_track_keeps_its_id_when_its_receiver_is_found() {
+    let folder = data_folder();
+    let server = trained_yard(folder.path()).await;
+    server.post("/v1/sites", &json!({"id": "square"})).await.expect(201);
+    let headers = [("content-type", "application/json"), ("if-match", "*")];
+    server.send("PATCH", "/v1/cameras/yard", &headers, r#"{"site": "square"}"#).await.expect(200);
+    let mut client = open(&channel(&server).await, "edge", false).await;
+    let rows = rows(&LIVE.recorded());
+    let (first, last) = (rows[0].time, rows.last().expect("rows").time);
+    let shift = now().duration_since(last);
+    let before = rows.iter().take_while(|row| row.time.duration_since(first).as_secs_f64() <= SENT_FIRST_S);
+    let mut named: BTreeMap<usize, String> = BTreeMap::new();
+    for row in before.clone() {
+        let answer = sent(&mut client, item(row, shift)).await;
+        named.extend(row.walker.zip(answer.world_track_id));
+    }
+    for carrier in 0..LIVE.phones {
+        let latest = before.clone().filter(|row| row.walker == Some(carrier)).last().expect("a box");
+        wait_for_match(&mut client, latest, shift).await;
+        let tracks = server.get("/v1/sites/square/tracks").await.expect(200).json();
+        let phone = format!("phone-{carrier}");
+        let of_phone = |track: &&serde_json::Value| track["receiver_match"]["receiver_id"] == phone.as_str();
+        let carried: Vec<_> = tracks["items"].as_array().expect("tracks").iter().filter(of_phone).collect();
+        assert_eq!(carried.len(), 1, "{tracks}");
+        assert_eq!(carried[0]["id"], named[&carrier], "{tracks}");
+        assert_eq!(carried[0]["target_id"], phone, "{tracks}");
+        assert!(carried[0]["receiver_match"]["probability"].as_f64() >= Some(0.6), "{tracks}");
+    }
 }
 
 /// All samples of the camera.

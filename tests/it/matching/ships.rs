@@ -51,7 +51,7 @@ impl Way {
     }
 }
 
-/// Two ships that pass so many times each, and twenty emitters that are never seen.
+/// Two ships that pass `passes` times each, and twenty emitters that are never seen.
 pub(super) fn recorded(seed: u64, passes: usize) -> Recorded {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let yaw: f64 = random.random_range(0.0..std::f64::consts::TAU);

@@ -329,15 +329,13 @@ async fn positions_are_published_to_a_nats_broker_also_those_of_its_absence() {
     broker.wait().expect("it is gone");
 }
 
-/// A nats-server, which speaks MQTT 3.1.1 alone; killed when dropped.
-struct Mqtt3(std::process::Child);
+/// A nats-server; killed when dropped.
+pub(crate) struct Nats(std::process::Child);
 
-impl Mqtt3 {
-    fn start(folder: &std::path::Path, port: u16) -> Self {
-        let settings = format!(
-            "server_name: mqtt\nport: -1\njetstream {{ store_dir: \"{}\" }}\nmqtt {{ host: 127.0.0.1, port: {port} }}\n",
-            folder.display()
-        );
+impl Nats {
+    /// Starts with settings of which one names the port, and with JetStream.
+    pub(crate) fn start(folder: &std::path::Path, settings: &str, port: u16) -> Self {
+        let settings = format!("jetstream {{ store_dir: \"{}\" }}\n{settings}\n", folder.display());
         let path = folder.join("nats.conf");
         std::fs::write(&path, settings).expect("a file can be written");
         let mut command = std::process::Command::new("nats-server");
@@ -350,7 +348,67 @@ impl Mqtt3 {
     }
 }
 
-impl Drop for Mqtt3 {
+/// Has JetStream answer a request.
+pub(crate) async fn ask_jetstream(address: std::net::SocketAddr, request: &str, body: &Value) -> Value {
+    let mut stream = BufReader::new(TcpStream::connect(address).await.expect("a connection"));
+    let body = body.to_string();
+    let sent = format!(
+        "CONNECT {{\"verbose\":false}}\r\nSUB answers 1\r\nPUB $JS.API.{request} answers {}\r\n{body}\r\n",
+        body.len()
+    );
+    stream.get_mut().write_all(sent.as_bytes()).await.expect("written");
+    loop {
+        let mut line = String::new();
+        assert!(stream.read_line(&mut line).await.expect("a line") > 0, "the connection is closed");
+        if line.starts_with("MSG answers") {
+            line.clear();
+            stream.read_line(&mut line).await.expect("an answer");
+            return serde_json::from_str(&line).expect("JSON");
+        }
+    }
+}
+
+#[tokio::test]
+#[ignore = "needs nats-server"]
+async fn a_position_is_delivered_to_nats_when_a_stream_has_stored_it_and_tls_trusts_the_server() {
+    let (authority, other) = (Authority::new(), Authority::new());
+    let (folder, files, address) = (data_folder(), data_folder(), own_address());
+    let (certificate, key) = authority.issue();
+    let [certificate_file, key_file] = ["cert.pem", "key.pem"].map(|name| files.path().join(name));
+    std::fs::write(&certificate_file, certificate.pem()).expect("a file can be written");
+    std::fs::write(&key_file, key.serialize_pem()).expect("a file can be written");
+    // The test's own requests are not encrypted.
+    let settings = format!(
+        "listen: \"{address}\"\nallow_non_tls: true\ntls {{ cert_file: {certificate_file:?}, key_file: {key_file:?} }}"
+    );
+    let _broker = Nats::start(files.path(), &settings, address.port());
+    let server = TestServer::start(folder.path());
+    create_gate(&server).await;
+    let sink = json!({"id": "nats", "sink": {
+        "address": format!("natss://localhost:{}", address.port()), "camera_ids": ["gate"], "min_interval_s": 0,
+        "jetstream": true, "ca_certificate": other.certificate.pem(),
+    }});
+    server.post("/v1/connections", &sink).await.expect(201);
+    let waiting = connection_when(&server, "nats", |status| status["state"] == "waiting").await;
+    assert!(waiting["status"]["last_error"].to_string().contains("certificate"), "{waiting}");
+
+    let trust = json!({"sink": {"ca_certificate": authority.certificate.pem()}});
+    patch(&server, "nats", &trust).await.expect(200);
+    connection_when(&server, "nats", |status| status["state"] == "running").await;
+    send_fix(&server, "van", &now().to_string(), 103.98678, false).await;
+    let is_named =
+        |status: &Value| status["last_error"]["message"].to_string().contains("no JetStream stream");
+    let waiting = connection_when(&server, "nats", is_named).await;
+    assert_eq!(waiting["status"]["queued"], 1, "nobody has stored it");
+
+    let stream = json!({"name": "positions", "subjects": ["sightfix.>"]});
+    ask_jetstream(address, "STREAM.CREATE.positions", &stream).await;
+    connection_when(&server, "nats", |status| status["queued"] == 0).await;
+    let shown = ask_jetstream(address, "STREAM.INFO.positions", &json!({})).await;
+    assert_eq!(shown["state"]["messages"], 1, "{shown}");
+}
+
+impl Drop for Nats {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
@@ -361,7 +419,9 @@ impl Drop for Mqtt3 {
 #[ignore = "needs nats-server and mosquitto-clients"]
 async fn a_broker_of_mqtt_3_1_1_brings_phones_and_takes_positions() {
     let (folder, port) = (data_folder(), own_address().port());
-    let _broker = Mqtt3::start(folder.path(), port);
+    // It speaks MQTT 3.1.1 alone.
+    let settings = format!("server_name: mqtt\nport: -1\nmqtt {{ host: 127.0.0.1, port: {port} }}");
+    let _broker = Nats::start(folder.path(), &settings, port);
     let data = data_folder();
     let server = TestServer::start(data.path());
     create_gate(&server).await;

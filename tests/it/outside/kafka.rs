@@ -17,13 +17,13 @@ const TOPIC: &str = "detections";
 
 /// A cluster of one broker, which has four partitions per topic and creates topics when they are asked for; killed when
 /// dropped.
-struct Cluster {
+pub(crate) struct Cluster {
     process: Child,
-    address: String,
+    pub(crate) address: String,
 }
 
 impl Cluster {
-    fn start() -> Self {
+    pub(crate) fn start() -> Self {
         let mut command = Command::new("kcat");
         command.args(["-b", "none", "-X", "test.mock.num.brokers=1", "-d", "mock", "-P", "-t", TOPIC]);
         command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
@@ -42,7 +42,7 @@ impl Cluster {
         Self { process, address }
     }
 
-    fn signal(&self, signal: &str) {
+    pub(crate) fn signal(&self, signal: &str) {
         let status = Command::new("kill").args([signal, &self.process.id().to_string()]).status();
         assert!(status.expect("kill exists").success());
     }
@@ -63,7 +63,7 @@ impl Cluster {
     }
 
     /// The first messages of a topic as kcat reads them: key, headers and content.
-    fn received(&self, topic: &str, count: usize) -> Vec<(String, String, Value)> {
+    pub(crate) fn received(&self, topic: &str, count: usize) -> Vec<(String, String, Value)> {
         let mut command = Command::new("kcat");
         command.args([
             "-b",

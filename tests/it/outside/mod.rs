@@ -2,10 +2,10 @@
 //! contain `broker` start a real mosquitto or nats-server, or librdkafka's mock cluster, and those with `rtsp` GStreamer's RTSP
 //! server; they are ignored by default, and `.ci/run` installs what they need and runs them.
 
-mod broker;
+pub(crate) mod broker;
 mod files;
 mod filters;
-mod kafka;
+pub(crate) mod kafka;
 mod messages;
 pub(crate) mod peers;
 mod phones;

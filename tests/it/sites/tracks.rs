@@ -56,7 +56,7 @@ impl Events {
         }
     }
 
-    /// Events until so many of a name have come.
+    /// Events until `count` of a name have come.
     pub(super) async fn until(&mut self, name: &str, count: usize) -> Vec<SiteEvent> {
         let mut events: Vec<SiteEvent> = Vec::new();
         while events.iter().filter(|event| event.name == name).count() < count {

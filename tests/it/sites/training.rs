@@ -57,7 +57,7 @@ fn samples_csv(site: &SimulatedSite, camera: usize) -> String {
     csv
 }
 
-/// The site `square` with two cameras and their samples; the second camera gets at most so many.
+/// The site `square` with two cameras and their samples; the second camera gets at most `second_samples`.
 async fn create(server: &TestServer, site: &SimulatedSite, second_samples: usize) {
     server.post("/v1/sites", &json!({"id": "square"})).await.expect(201);
     let size = site.image_size;

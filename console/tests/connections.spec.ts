@@ -166,3 +166,21 @@ test.describe('every kind', () => {
     await expect(dialog.getByRole('alert').locator('[lang=en]')).toContainText('must begin with');
   });
 });
+
+test('a sink of NATS over TLS asks for an authority and the certificate of the client', async ({ console: page, server }) => {
+  await server.request('POST', '/v1/cameras', { id: 'gate' });
+  await page.goto(`${server.url}/#/settings/connections`);
+  const dialog = await newConnection(page, 'NATS');
+  const certificates = dialog.getByText('Certificates', { exact: true });
+  await expect(certificates).toHaveCount(0);
+  await dialog.getByLabel(/^Name/).fill('Bus');
+  await dialog.getByLabel('Address').fill('natss://127.0.0.1:4222');
+  await certificates.click();
+  await expect(dialog.getByLabel(/^Authority of the peer/)).toBeVisible();
+  await expect(dialog.getByLabel(/^Client certificate/)).toBeVisible();
+  await dialog.getByLabel('Topic or subject').fill('site.{camera}');
+  await dialog.getByRole('button', { name: 'Connect' }).click();
+  await expect(card(page, 'Bus')).toContainText('natss://127.0.0.1:4222');
+  const { items } = await server.request<{ items: { sink?: { address: string; topic?: string } }[] }>('GET', '/v1/connections');
+  expect(items.map(({ sink }) => sink)).toMatchObject([{ address: 'natss://127.0.0.1:4222', topic: 'site.{camera}' }]);
+});

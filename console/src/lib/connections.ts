@@ -2,7 +2,7 @@
 import type { TextKey } from './texts';
 import type { Connection } from './types';
 
-/** What a form asks for. */
+/** The fields of a form. */
 export type Field = 'topics' | 'topic' | 'cameras' | 'camera_ids' | 'receiver_id' | 'store_samples' | 'username' | 'min_interval_s' | 'cot' | 'ca_certificate';
 export type Secret = 'password' | 'signing_key' | 'authorization' | 'client_certificate' | 'client_key';
 
@@ -33,7 +33,7 @@ export const KINDS: Kind[] = [
   sink('home-assistant', 'connections.kind.homeAssistant', 'home_assistant', [MQTT, 'mqtts://broker:8883'], ['topic', 'username', 'ca_certificate']),
   sink('mqtt', 'connections.kind.mqtt', 'json', [MQTT, 'mqtts://broker:8883'], ['topic', 'username', 'ca_certificate']),
   sink('kafka', 'connections.kind.kafka', 'json', [KAFKA, 'kafkas://broker:9093'], ['topic', 'username', 'ca_certificate']),
-  sink('nats', 'connections.kind.nats', 'json', ['nats://localhost:4222'], ['topic', 'username']),
+  sink('nats', 'connections.kind.nats', 'json', ['nats://localhost:4222', 'natss://nats.example.org:4222'], ['topic', 'username', 'ca_certificate']),
   sink('webhook', 'connections.kind.webhook', 'json', ['https://hooks.example.org/positions'], ['ca_certificate']),
   sink('cot', 'connections.kind.cot', 'cot', ['udp://239.2.3.1:6969', 'tcp://tak.example.org:8087', 'tls://tak.example.org:8089'], ['cot', 'ca_certificate']),
   sink('onvif-frames', 'connections.kind.onvifFrames', 'onvif', ['udp://239.2.3.1:6970', 'tcp://vms.example.org:6970', 'tls://vms.example.org:6971', MQTT], ['topic', 'username', 'ca_certificate']),
@@ -41,8 +41,8 @@ export const KINDS: Kind[] = [
 
 const schemeOf = (address: string): string => address.split(':')[0]!;
 /** The name of a user, its password and an authority belong to addresses that have a peer to sign in at. */
-const isEncrypted = (address: string): boolean => /^(mqtts|kafkas|rtsps|tls|https)$/.test(schemeOf(address));
-const isBroker = (address: string): boolean => /^(mqtts?|kafkas?|nats)$/.test(schemeOf(address));
+const isEncrypted = (address: string): boolean => /^(mqtts|kafkas|natss|rtsps|tls|https)$/.test(schemeOf(address));
+const isBroker = (address: string): boolean => /^(mqtts?|kafkas?|natss?)$/.test(schemeOf(address));
 const hasUsers = (address: string): boolean => isBroker(address) || /^rtsps?$/.test(schemeOf(address));
 
 /** Fields of a kind that an address leaves open. */
@@ -73,7 +73,7 @@ export function kindOf({ source, sink: target }: Connection): Kind | undefined {
   return sinks.find((kind) => kind.addresses.some((address) => schemeOf(address).replace(/s$/, '') === scheme.replace(/s$/, ''))) ?? (sinks.length === 1 ? sinks[0] : undefined);
 }
 
-/** What a form holds; texts are empty where nothing is given. */
+/** The values of a form; texts are empty where nothing is given. */
 export interface ConnectionForm {
   address: string;
   topics: string;

@@ -1,4 +1,4 @@
-// Whether this server asks for a key, and what the signed-in caller may do.
+// Access: if this server asks for a key, and what the signed-in caller may do.
 import { get } from './api';
 import type { Session } from './types';
 

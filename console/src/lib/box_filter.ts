@@ -43,7 +43,7 @@ function contains(area: ImagePoint[], { x, y }: { x: number; y: number }): boole
   return isInside;
 }
 
-/** Whether a box passes; a class or a score that is not known does. */
+/** True if a box passes; a class or a score that is not known does. */
 export function isTaken(filter: BoxFilter, { box, class: own, score }: ShownBox): boolean {
   if (own && filter.classes.length > 0 && !filter.classes.some((it) => it.toLowerCase() === own.toLowerCase())) return false;
   if (score !== undefined && score < filter.leastScore) return false;

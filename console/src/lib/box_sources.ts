@@ -12,7 +12,7 @@ export interface BoxSource {
   format?: string;
   /** Topics that are proposed. */
   topics?: string;
-  /** Whether its boxes are shares of the image, which need the image's size. */
+  /** True if its boxes are shares of the image, which need the image's size. */
   needsSize?: boolean;
   mapping?: JsonMapping;
 }
@@ -41,7 +41,7 @@ export const BOX_SOURCES: BoxSource[] = [
   { key: 'file', text: 'boxes.file', help: 'boxes.file.help', addresses: [] },
 ];
 
-/** What the form of a source holds; texts are empty where nothing is given. */
+/** The form of a source; texts are empty where nothing is given. */
 export interface BoxSourceForm {
   address: string;
   topics: string;
@@ -54,9 +54,9 @@ export function emptyForm(source: BoxSource): BoxSourceForm {
   return { address: source.addresses[0] ?? '', topics: source.topics ?? '', senderName: '', username: '', password: '' };
 }
 
-/** Whether an address has topics. */
+/** True if an address has topics. */
 export const hasTopics = (address: string): boolean => /^(mqtts?|kafkas?):/.test(address);
-/** Whether an address may ask for a user. */
+/** True if an address may ask for a user. */
 export const hasUsers = (address: string): boolean => hasTopics(address) || /^rtsps?:/.test(address);
 
 /** The request for the connection that brings a camera's boxes. */

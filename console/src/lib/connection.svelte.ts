@@ -1,4 +1,4 @@
-// Whether the server answers, and whether it asks for a key.
+// The state of the connection: if the server answers, and if it asks for a key.
 
 /** When this page last loaded itself again, ms since 1970. */
 const RELOADED_AT = 'sightfix.reloaded_at';
@@ -6,7 +6,7 @@ const RELOAD_AGAIN_AFTER_MS = 60_000;
 
 class Connection {
   lost = $state(false);
-  /** Whether a part of the page could not be loaded: the line broke, or the server has a newer release. */
+  /** True if a part of the page could not be loaded: the line broke, or the server has a newer release. */
   isIncomplete = $state(false);
   #timer: ReturnType<typeof setTimeout> | undefined;
 

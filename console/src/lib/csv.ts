@@ -28,7 +28,7 @@ export interface Mapping {
   columns: Record<string, number>;
   boxForm: BoxForm;
   normalised: boolean;
-  /** Whether numbers may have a decimal comma: where it is not the separator. */
+  /** True if numbers may have a decimal comma: where it is not the separator. */
   decimalComma: boolean;
   /** Used where there is no column of the target. */
   targetId: string;
@@ -109,7 +109,7 @@ function plain(name: string): string {
   return name.toLowerCase().replace(/_?(px|deg|m2)$/, '').replace(/[^\p{L}\p{N}]/gu, '');
 }
 
-/** What a file is, and how its columns map: the operator sees it and may change it. */
+/** The format of a file, and the mapping of its columns: the operator sees both and may change them. */
 export function guessMapping(table: Table): Mapping {
   const names = table.header.map(plain);
   const columns: Record<string, number> = {};
@@ -145,7 +145,7 @@ export function outputColumns(mapping: Mapping): string[] {
   return [...REQUIRED[mapping.kind], ...optional];
 }
 
-/** What is missing before a file can be imported, by field; empty if nothing is. */
+/** The fields that are missing before a file can be imported, with the reason; empty if none is. */
 export function missingFields(mapping: Mapping): string[] {
   return REQUIRED[mapping.kind].filter(
     (field) => (mapping.columns[field] ?? -1) < 0 && !(field === 'target_id' && mapping.targetId.trim()),
@@ -157,7 +157,7 @@ const UNIX_TIME = /^\d[\d.,]*$/;
 /** Unix times below are seconds, others milliseconds. */
 const FEWEST_UNIX_MS = 1e11;
 
-/** Whether a file has times without an offset, which are the local times of a zone. */
+/** True if a file has times without an offset, which are the local times of a zone. */
 export function hasLocalTimes({ rows }: Table, { columns }: Mapping): boolean {
   const times = rows.slice(0, 200).map(({ cells }) => cells[columns.time ?? -1] ?? '');
   return times.some((time) => LOCAL_TIME.test(time));

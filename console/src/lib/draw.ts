@@ -1,4 +1,4 @@
-// What is drawn on both planes, as plain functions of a canvas: tested by what they call.
+// Drawing on both planes, as plain functions of a canvas: tested by their calls.
 
 import type { Covariance } from './types';
 

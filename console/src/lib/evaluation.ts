@@ -4,7 +4,7 @@ import { toPlane, type EastNorth } from './geo';
 import type { Recipe } from './recipes';
 import type { EvaluatedPosition, Evaluation, Position } from './types';
 
-/** What a recipe is compared with: the receiver, a filter, and a plain homography. */
+/** The methods that a recipe is compared with: the receiver, a filter, and a plain homography. */
 export function comparedMethods(recipe: Recipe): string[] {
   return ['gnss', 'imm_ukf', 'homography.denied', `${recipe}.two_step`];
 }
@@ -49,7 +49,7 @@ export function calibrationCurve(positions: EvaluatedPosition[], stated: number[
   return levels.length > 0 ? cumulativeShare(levels, stated) : null;
 }
 
-/** What the true positions are: points, or the corners of a line. */
+/** The form of the true positions: points, or the corners of a line. */
 export interface TruthShape {
   points: Position[];
   isLine: boolean;

@@ -3,7 +3,7 @@ import { connection } from './connection.svelte';
 
 export interface EventHandlers {
   on: Record<string, (data: unknown) => void>;
-  /** Whether events can come now. */
+  /** True if events can come now. */
   state: (isOpen: boolean) => void;
 }
 

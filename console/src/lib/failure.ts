@@ -1,4 +1,4 @@
-// What is said of something that failed: the kind in the language of the page, the details in the server's own words.
+// The text of a failure: the kind in the language of the page, the details in the server's own words.
 import { ApiProblem } from './api';
 import { t } from './i18n.svelte';
 import { texts, type TextKey } from './texts';

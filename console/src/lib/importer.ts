@@ -41,7 +41,7 @@ async function rowsFrom({ file, table }: SourceFile): Promise<number> {
   return from;
 }
 
-/** What the importer is told of a file. */
+/** The settings of a file that the importer gets. */
 function layoutOf({ boxForm, normalised, targetId }: Mapping, timezone: string | undefined): URLSearchParams {
   const layout = new URLSearchParams({ columns: 'auto', box_form: boxForm, box_unit: normalised ? 'share' : 'px' });
   if (timezone) layout.set('timezone', timezone);

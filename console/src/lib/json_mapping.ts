@@ -86,7 +86,7 @@ export function listsOf(value: Json, pointer = ''): { pointer: string; first: Js
   return Object.entries(value).flatMap(([name, part]) => listsOf(part, `${pointer}/${escaped(name)}`));
 }
 
-/** What a message can be mapped by: the pointers of one item, and a proposal. Undefined for what is no JSON object with a box. */
+/** The possible mappings of a message: the pointers of one item, and a proposal. Undefined for what is no JSON object with a box. */
 export function proposed(text: string): { mapping: JsonMapping; leaves: Leaf[] } | undefined {
   let message: Json;
   try {

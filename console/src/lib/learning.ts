@@ -4,7 +4,7 @@ import { href } from './router.svelte';
 import type { TextKey } from './texts';
 import type { Camera, Learning } from './types';
 
-/** What only the page that shows the progress can do itself. */
+/** Actions that only the page that shows the progress can take. */
 export type LearningAction = 'start' | 'phone';
 
 export interface LearningAdvice {

@@ -62,7 +62,7 @@ export class Live {
     cancelAnimationFrame(this.#frame);
   }
 
-  /** What was tracked before the events began. */
+  /** The tracks from before the events began. */
   async #readTracks(camera: string): Promise<void> {
     const read = async (...path: string[]): Promise<TrackFeature[]> =>
       (await get<{ features: TrackFeature[] }>(cameraPath(camera, 'tracks', ...path)).catch(() => ({ features: [] }))).features;

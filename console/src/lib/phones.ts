@@ -5,7 +5,7 @@ import { slugOf } from './slug';
 import type { TextKey } from './texts';
 import type { Connection } from './types';
 
-/** What a phone needs to reach the server. */
+/** The settings by which a phone reaches the server. */
 export interface PhoneAccess {
   /** Where messages are posted. */
   url: string;
@@ -25,7 +25,7 @@ export interface PhoneApplication {
 const withKey = ({ url, key }: PhoneAccess): string => (key ? `${url}/${key}` : url);
 const signIn = ({ key, receiver }: PhoneAccess): [TextKey, string][] => (key ? [['phone.user', receiver], ['phone.password', key]] : []);
 
-/** What a rest_command posts: a template with the attributes of the companion's device tracker. */
+/** The body of a rest_command: a template with the attributes of the companion's device tracker. */
 function homeAssistantBody(receiver: string): string {
   const entity = `device_tracker.${slugOf(receiver).replaceAll('-', '_')}`;
   const attribute = (name: string): string => `{{ state_attr('${entity}', '${name}') }}`;

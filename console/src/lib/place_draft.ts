@@ -26,7 +26,7 @@ export interface PlaceDraft {
   radius_m: number | null;
   probability: number;
   rules: RuleDraft[];
-  /** Of a place that is stored. */
+  /** Id of a place that is stored. */
   revision?: number;
 }
 
@@ -112,7 +112,7 @@ function ruleOf({ id, kind, classes, probability, ...thresholds }: RuleDraft): P
   };
 }
 
-/** What can be changed of a place. */
+/** The changeable fields of a place. */
 export function settingsOf(draft: PlaceDraft): object {
   return {
     display_name: draft.display_name || null,

@@ -1,4 +1,4 @@
-// What happened at the places of a site or a camera, newest first.
+// Events at the places of a site or a camera, newest first.
 import { get } from './api';
 import { listen } from './events';
 import { failureOf, type Failure } from './failure';

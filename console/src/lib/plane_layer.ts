@@ -4,7 +4,7 @@ import { drawLine, palette, prepare, type Context, type Palette, type Pixel } fr
 import { metresPerPixel, roundLength } from './geo';
 import type { Position } from './types';
 
-/** What a view gets to draw on. */
+/** The canvas that a view draws on. */
 export interface PlaneView {
   context: Context;
   colors: Palette;

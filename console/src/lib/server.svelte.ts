@@ -1,4 +1,4 @@
-// What the server says of itself; read once.
+// The description that the server gives of itself; read once.
 import { del, get } from './api';
 import type { ServerInfo } from './types';
 

@@ -11,7 +11,7 @@ export interface SiteTarget extends WorldTrack {
   heardAt_ms: number;
 }
 
-/** What happened to a track beside that it moved. */
+/** Events of a track other than moves. */
 export interface TrackChange {
   kind: 'handed_over' | 'identified' | 'merged';
   time: string;

@@ -44,7 +44,7 @@ const table = {
   'demonstration.text': ['Everything here is simulated: people, carts, a ship, cameras and phones.', 'Alles hier ist simuliert: Menschen, Wagen, ein Schiff, Kameras und Telefone.'],
   'demonstration.title': ['Demonstration', 'Vorführung'],
 
-  // What the flags of a position mean, by their name.
+  // Meanings of the flags of a position, by their name.
   'flag.gnss_denied': ['No fix came with the box: the position is from the box alone.', 'Zur Box kam kein Fix: Die Position stammt nur aus der Box.'],
   'flag.box_missing': ['No box came with the fix: the position is the fix.', 'Zum Fix kam keine Box: Die Position ist der Fix.'],
   'flag.box_at_border': ['The border of the image cuts the box, so its foot may be hidden.', 'Der Bildrand schneidet die Box, ihr Fuß ist vielleicht verdeckt.'],

@@ -1,4 +1,4 @@
-// Whether this browser may ask another server for map tiles.
+// The consent to ask another server for map tiles, in this browser.
 const STORED = 'sightfix.tile_consent';
 
 class TileConsent {

@@ -20,7 +20,7 @@ export interface ImageSize {
 }
 export type JobState = 'queued' | 'running' | 'cancelling' | 'succeeded' | 'failed' | 'cancelled';
 
-/** Whether a job has not ended. */
+/** True if a job has not ended. */
 export function isLive(state: JobState): boolean {
   return state === 'queued' || state === 'running' || state === 'cancelling';
 }
@@ -144,7 +144,7 @@ export interface RunProgress {
   error_scale: number | null;
   remaining_s?: number | null;
 }
-/** What training runs of cameras and of sites have in common. */
+/** The fields of every training run, whether its subject is a camera or a site. */
 interface Run {
   id: string;
   seed: number;
@@ -163,7 +163,7 @@ export interface TrainingRun extends Run {
   epochs?: number;
   attempt: number;
   model_version?: number;
-  /** Of models that came with a report. */
+  /** Missing where the model came without a report. */
   report?: { advice: string[] };
 }
 /** How long a run that has ended took, s. */
@@ -334,7 +334,7 @@ export interface EvaluationReport {
 export interface ServerInfo {
   version: string;
   limits: Record<string, number>;
-  /** Whether what the server answers is simulated. */
+  /** True if the answers of the server are simulated. */
   demonstration: boolean;
   tiles?: Tiles;
   /** Tiles of another server, which is asked once the user agrees. */
@@ -357,7 +357,7 @@ export interface AuditEntry {
   actor: string;
   address?: string;
   request_id?: string;
-  /** What happened, such as `camera-created`. */
+  /** The kind of event, such as `camera-created`. */
   action: string;
   subject?: string;
   camera_id?: string;

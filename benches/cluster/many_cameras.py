@@ -1,4 +1,4 @@
-"""What nodes of one cluster cost with many cameras: start, memory, idle polls, and activation on every node.
+"""The costs of nodes of one cluster with many cameras: start, memory, idle polls, and activation on every node.
 
 Usage: python3 benches/cluster/many_cameras.py URL [CAMERAS]
 

@@ -164,7 +164,7 @@ def timed(server: Server, port: int, boxes: int, *, stores: bool) -> float:
 
 
 def paced(server: Server, port: int, boxes: int, rate: float, *, stores: bool) -> dict[str, float]:
-    """What the status says while boxes come at a rate."""
+    """The status while boxes come at a rate."""
     name = prepare(server, port, stores=stores)
     worker = os.fork()
     if worker == 0:

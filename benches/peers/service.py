@@ -1,4 +1,4 @@
-"""What one would write instead of sightfix: FastAPI, PyTorch on the processor, and SQLite.
+"""A service that one would write instead of sightfix: FastAPI, PyTorch on the processor, and SQLite.
 
 The same three endpoints with the same paths and bodies: samples of a camera are stored, a run trains
 the camera's auto-encoder, and observations are fused with the weights of the paper's (6) to (8). No

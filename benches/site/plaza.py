@@ -1,4 +1,4 @@
-"""What training the cameras of a real site together gains, on people whose phones no camera was trained on.
+"""The gain of training the cameras of a real site together, on people whose phones no camera was trained on.
 
 Usage: python3 benches/site/plaza.py FOLDER [SEED]
 

@@ -56,7 +56,7 @@ pub struct Learning {
     pub training_run: Option<RunId>,
 }
 
-/// What cameras record to learn by themselves, and what becomes of it.
+/// Recordings from which cameras learn by themselves, and the attempts to learn.
 #[derive(Clone, Copy)]
 pub struct Recordings<'a> {
     store: &'a Store,
@@ -69,7 +69,7 @@ pub struct Recordings<'a> {
 }
 
 impl App {
-    /// What cameras record to learn by themselves, and what becomes of it.
+    /// Recordings from which cameras learn by themselves, and the attempts to learn.
     #[must_use]
     pub fn recordings(&self) -> Recordings<'_> {
         Recordings {

@@ -50,7 +50,7 @@ pub(super) struct FileRow<'a> {
     pub class: Option<Text<'a>>,
     pub score: Option<f64>,
     pub truth: Option<wire::Position>,
-    /// Of a live item; beside `match_probability` what `sightfix pair --match` says about its samples, which is not stored.
+    /// The score of a live item; next to `match_probability`, the score that `sightfix pair --match` states, which is not stored.
     #[serde(borrow)]
     pub tracker_id: Option<Text<'a>>,
     #[serde(rename = "match_probability")]

@@ -15,7 +15,7 @@ const COLUMNS: &str = "time,camera_id,site_id,track_id,target_id,class,longitude
                        acceleration_north_mps2,acceleration_covariance_east_m2_s4,\
                        acceleration_covariance_north_m2_s4,acceleration_covariance_east_north_m2_s4";
 
-/// What a file of positions of finished tracks is.
+/// The format of a file of positions of finished tracks.
 #[derive(Debug, Clone, PartialEq)]
 pub enum HistoryFormat {
     /// A row per position.

@@ -12,7 +12,7 @@ use crate::geo::{EastNorth, LocalPlane, Position};
 /// Tracks that are remembered before those that have ended are forgotten.
 const TRACKS: usize = 10_000;
 
-/// What frames and coordinates are counted from.
+/// The origins of frame numbers and coordinates.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotFrames {
     plane: LocalPlane,

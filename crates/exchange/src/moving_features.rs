@@ -44,7 +44,7 @@ pub struct MovingFeature {
     /// First and last instant.
     #[schema(value_type = Vec<String>)]
     time: Vec<Timestamp>,
-    /// What does not change.
+    /// The properties that do not change.
     properties: MovingTarget,
 }
 

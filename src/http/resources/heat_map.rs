@@ -70,7 +70,7 @@ struct CellOutline {
     coordinates: [[[f64; 2]; 5]; 1],
 }
 
-/// What happened in a cell.
+/// The figures of a cell.
 #[derive(Serialize, ToSchema)]
 struct CellHeat {
     /// Time that all targets together spent there.

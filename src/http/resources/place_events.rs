@@ -36,7 +36,7 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 struct PlaceEventPage {
     /// A page of events.
     items: Vec<PlaceEvent>,
-    /// What to continue after, here and in the stream; missing if no event was ever read.
+    /// The event to continue after, here and in the stream; missing if no event was ever read.
     #[serde(skip_serializing_if = "Option::is_none")]
     last_event_id: Option<String>,
     /// True if there are more events now.

@@ -212,7 +212,7 @@ impl SiteTracker {
         }
     }
 
-    /// What a round of matching needs, if there is anything to match.
+    /// The input of a round of matching, if there is anything to match.
     pub(super) fn window(&self) -> Option<(u64, WorldReceiverWindow)> {
         let window = self.active.as_ref().map(|active| &active.window)?;
         window.can_be_matched().then(|| (self.number_offset, window.clone()))

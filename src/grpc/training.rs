@@ -14,10 +14,7 @@ use super::proto::training_service_server::TrainingService;
 use super::statuses::{Reply, answer, context, to_status};
 use crate::admission::Lease;
 use crate::app::{App, RunRequest};
-use crate::domain::{
-    CameraId, CandidateFinding, EpochReport, Error, ErrorKind, JobState, Result, RunId, RunProgress,
-    TrainingReport, TrainingRun,
-};
+use crate::domain::{CameraId, EpochReport, Error, ErrorKind, Result, RunId, TrainingRun};
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
@@ -182,79 +179,6 @@ fn changes(
 
 fn ending() -> Error {
     Error::refused(ErrorKind::ShuttingDown, "the server is ending; the run goes on when it is back")
-}
-
-impl From<TrainingRun<CameraId>> for proto::TrainingRun {
-    fn from(run: TrainingRun<CameraId>) -> Self {
-        Self {
-            id: run.id.to_string(),
-            camera_id: run.subject.as_str().to_owned(),
-            recipe: proto::Recipe::from(run.options.recipe).into(),
-            seed: run.options.seed,
-            epochs: run.options.epochs,
-            from: run.options.from.map(timestamp),
-            until: run.options.until.map(timestamp),
-            state: proto::TrainingRunState::from(run.state).into(),
-            progress: Some(run.progress.into()),
-            attempt: run.attempt,
-            model_version: run.model_version,
-            report: run.report.map(Into::into),
-            outcome: run.outcome,
-            created_at: Some(timestamp(run.created_at)),
-            started_at: run.started_at.map(timestamp),
-            ended_at: run.ended_at.map(timestamp),
-        }
-    }
-}
-
-impl From<TrainingReport> for proto::TrainingReport {
-    fn from(report: TrainingReport) -> Self {
-        let text = report.to_string();
-        Self {
-            candidates: report.candidates.into_iter().map(Into::into).collect(),
-            advice: report.advice,
-            text,
-        }
-    }
-}
-
-impl From<CandidateFinding> for proto::CandidateFinding {
-    fn from(finding: CandidateFinding) -> Self {
-        Self {
-            candidate: finding.candidate,
-            weight: finding.weight,
-            held_out_miss_m: finding.held_out_miss_m,
-            coverage95_of_fixes: finding.coverage95_of_fixes,
-            summary: finding.summary,
-        }
-    }
-}
-
-impl From<JobState> for proto::TrainingRunState {
-    fn from(state: JobState) -> Self {
-        match state {
-            JobState::Queued => Self::Queued,
-            JobState::Running => Self::Running,
-            JobState::Cancelling => Self::Cancelling,
-            JobState::Succeeded => Self::Succeeded,
-            JobState::Failed => Self::Failed,
-            JobState::Cancelled => Self::Cancelled,
-        }
-    }
-}
-
-impl From<RunProgress> for proto::TrainingProgress {
-    fn from(progress: RunProgress) -> Self {
-        Self {
-            phase: progress.phase,
-            epoch: progress.epoch,
-            epochs: progress.epochs,
-            reconstruction_error: progress.reconstruction_error,
-            regression_error: progress.regression_error,
-            error_scale: progress.error_scale,
-            remaining_s: progress.remaining_s,
-        }
-    }
 }
 
 impl From<EpochReport> for proto::TrainingEpoch {

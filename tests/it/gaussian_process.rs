@@ -2,6 +2,7 @@
 
 use serde_json::json;
 use sightfix::grpc::proto;
+use sightfix::grpc::proto::training_run::Findings;
 use sightfix::grpc::proto::training_service_client::TrainingServiceClient;
 
 use crate::harness::{TestServer, data_folder, shared, simulated_csv};
@@ -90,7 +91,9 @@ async fn a_run_reports_what_it_found_on_every_way() {
     let address = format!("http://{}", server.address);
     let mut client = TrainingServiceClient::connect(address).await.expect("gRPC is on the same port");
     let by_grpc = client.get_training_run(request).await.expect("the run").into_inner().run;
-    let by_grpc = by_grpc.and_then(|run| run.report).expect("a report");
+    let Some(Findings::Report(by_grpc)) = by_grpc.and_then(|run| run.findings) else {
+        panic!("a run of a camera without its report")
+    };
     assert_eq!(by_grpc.text, text);
     assert_eq!(by_grpc.candidates[0].candidate, "gaussian_process");
     assert_eq!(by_grpc.advice.len(), run["report"]["advice"].as_array().map_or(0, Vec::len));

@@ -294,6 +294,7 @@ async fn a_cancelled_run_stores_nothing_and_both_interfaces_show_it_alike() {
     let mut client = SiteServiceClient::new(server.channel().await);
     let asked = proto::StartSiteTrainingRunRequest { site_id: "square".to_owned(), ..Default::default() };
     let run = client.start_site_training_run(asked).await.expect("queued").into_inner().run.expect("a run");
+    assert_eq!(run.subject, Some(proto::training_run::Subject::SiteId("square".to_owned())));
     let path = format!("{RUNS}/{}", run.id);
     server.post(&format!("{path}/cancel"), &json!({})).await.expect(200);
     let ended = until(&server, &path, has_ended).await;

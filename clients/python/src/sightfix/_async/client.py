@@ -19,10 +19,9 @@ from sightfix._async.keys import Keys
 from sightfix._async.models import Models
 from sightfix._async.places import Places
 from sightfix._async.samples import Samples
-from sightfix._async.site_training_runs import SiteTrainingRuns
 from sightfix._async.sites import Sites
 from sightfix._async.tracks import Tracks
-from sightfix._async.training_runs import TrainingRuns
+from sightfix._async.training_runs import SiteTrainingRuns, TrainingRuns
 from sightfix._async.transport import Transport
 from sightfix._items import LiveItem
 from sightfix._request import RetryPolicy, get, path

@@ -221,15 +221,7 @@ async fn sample_answer(served: &Served, observations: &Arc<Vec<Observation>>) ->
 
 /// Squares of 10 m on the ways of the targets, which are entered and left.
 async fn put_places(served: &Served) {
-    let rules = [EventKind::Enter, EventKind::Leave].map(|kind| Rule {
-        id: kind.as_str().to_owned(),
-        kind,
-        classes: Vec::new(),
-        after_s: None,
-        speed_mps: None,
-        distance_m: None,
-        probability: None,
-    });
+    let rules = [EventKind::Enter, EventKind::Leave].map(Rule::of);
     for number in 0..PLACES {
         let middle = &served.observations[number * served.observations.len() / PLACES];
         let plane = LocalPlane::new(middle.fix().expect("a fix").position);

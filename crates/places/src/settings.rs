@@ -175,6 +175,20 @@ impl PlaceSettings {
 }
 
 impl Rule {
+    /// The rule of a kind that needs nothing else, under the kind's name.
+    #[must_use]
+    pub fn of(kind: EventKind) -> Self {
+        Self {
+            id: kind.as_str().to_owned(),
+            kind,
+            classes: Vec::new(),
+            after_s: None,
+            speed_mps: None,
+            distance_m: None,
+            probability: None,
+        }
+    }
+
     fn check(&self, is_line: bool) -> Result<()> {
         check_text("id", &self.id, 63)?;
         if self.classes.len() > MAX_CLASSES {

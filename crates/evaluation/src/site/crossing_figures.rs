@@ -277,19 +277,14 @@ fn places(plane: &LocalPlane, positions: impl Iterator<Item = EastNorth>) -> Opt
 }
 
 fn place(number: usize, id: &str, geometry: Geometry) -> Option<Arc<Place>> {
-    let rule = Rule {
-        id: "crossed".to_owned(),
-        kind: EventKind::Cross,
-        classes: Vec::new(),
-        after_s: None,
-        speed_mps: None,
-        distance_m: None,
-        probability: None,
-    };
     let settings = PlaceSettings {
         display_name: id.to_owned(),
         labels: std::collections::BTreeMap::new(),
-        rules: if matches!(geometry, Geometry::LineString(_)) { vec![rule] } else { Vec::new() },
+        rules: if matches!(geometry, Geometry::LineString(_)) {
+            vec![Rule::of(EventKind::Cross)]
+        } else {
+            Vec::new()
+        },
         geometry,
         radius_m: None,
         probability: PlaceSettings::DEFAULT_PROBABILITY,

@@ -33,21 +33,12 @@ pub(super) fn of_square(options: &SiteOptions) -> [(&'static str, PlaceSettings)
 }
 
 fn settings(display_name: &str, geometry: Geometry, kinds: &[EventKind]) -> PlaceSettings {
-    let rule = |kind: &EventKind| Rule {
-        id: kind.as_str().to_owned(),
-        kind: *kind,
-        classes: Vec::new(),
-        after_s: None,
-        speed_mps: None,
-        distance_m: None,
-        probability: None,
-    };
     PlaceSettings {
         display_name: display_name.to_owned(),
         labels: BTreeMap::from([("demonstration".to_owned(), "simulated".to_owned())]),
         geometry,
         radius_m: None,
         probability: PlaceSettings::DEFAULT_PROBABILITY,
-        rules: kinds.iter().map(rule).collect(),
+        rules: kinds.iter().copied().map(Rule::of).collect(),
     }
 }

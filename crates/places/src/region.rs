@@ -11,6 +11,8 @@ use crate::normal::{Whitening, cumulative};
 
 /// Corners of a place, in all of its rings.
 const MAX_CORNERS: usize = 512;
+/// Mean width of an area, m. Points of one parallel lie beside a straight line by less.
+const LEAST_WIDTH_M: f64 = 0.01;
 /// Radius of a point's place, m.
 const MAX_RADIUS_M: f64 = 10_000.0;
 /// Beyond this latitude a degree of longitude is no measure any more.
@@ -80,6 +82,10 @@ impl Region {
         let outer = lines.next().unwrap_or_else(|| LineString::new(Vec::new()));
         let polygon = Polygon::new(outer, lines.collect());
         polygon.check_validation().map_err(|fault| invalid(format!("is not valid: {fault}")))?;
+        let (area_m2, border_m) = (signed_area(&rings[0]).abs(), perimeter(&rings[0]));
+        if 2.0 * area_m2 < LEAST_WIDTH_M * border_m {
+            return Err(invalid("has no area: its corners lie on one line"));
+        }
         let oriented = rings.into_iter().enumerate().map(|(number, mut ring)| {
             ring.pop();
             if (signed_area(&ring) > 0.0) != (number == 0) {
@@ -256,6 +262,11 @@ pub(crate) fn is_inside(ring: &[EastNorth], point: EastNorth) -> bool {
 fn signed_area(ring: &[EastNorth]) -> f64 {
     let edges = ring.iter().zip(ring.iter().cycle().skip(1));
     edges.map(|(from, to)| from.east_m * to.north_m - to.east_m * from.north_m).sum::<f64>() * 0.5
+}
+
+/// Length of a closed ring, m.
+fn perimeter(ring: &[EastNorth]) -> f64 {
+    ring.windows(2).map(|pair| pair[0].distance_m(pair[1])).sum()
 }
 
 fn line_string(points: &[EastNorth]) -> LineString {

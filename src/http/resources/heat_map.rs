@@ -7,7 +7,7 @@ use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use super::history::selection;
+use super::history::{SelectionParams, selection};
 use crate::app::{HeatCell, HeatMap};
 use crate::domain::{Error, Result};
 use crate::http::plumbing::access::CallerApp;
@@ -99,15 +99,7 @@ impl From<&HeatCell> for HeatFeature {
 #[utoipa::path(
     get, path = "/v1/history/heat-map", tag = "history",
     params(
-        ("camera" = Option<String>, Query, description = "The camera whose tracks are meant; either this or `site`"),
-        ("site" = Option<String>, Query, description = "The site whose world tracks are meant"),
-        ("from" = Option<String>, Query, format = DateTime, description = "From this instant on (RFC 3339)"),
-        ("until" = Option<String>, Query, format = DateTime, description = "Before this instant (RFC 3339)"),
-        ("bbox" = Option<String>, Query, description = "Only within `west,south,east,north`, degrees"),
-        ("class" = Option<String>, Query, description = "Only targets of this class"),
-        ("target_id" = Option<String>, Query, description = "Only this target"),
-        ("receiver_id" = Option<String>, Query, description = "Only the target that carries this receiver"),
-        ("track_id" = Option<String>, Query, description = "Only this track"),
+        SelectionParams,
         ("cell_m" = Option<f64>, Query, minimum = 0.1, maximum = 10_000.0, description = "Extent of a cell, m; 1 if left out"),
     ),
     responses(

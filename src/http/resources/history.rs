@@ -8,7 +8,7 @@ use hyper::Uri;
 use hyper::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
 use hyper::http::HeaderValue;
 use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
+use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -113,6 +113,40 @@ impl HistoryFormat {
     }
 }
 
+/// The description of the parameters that [`selection`] reads.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Query)]
+#[expect(dead_code, reason = "the description alone; `Params` reads and refuses as all requests do")]
+pub(super) struct SelectionParams {
+    /// The camera whose tracks are meant; either this or `site`
+    #[param(required = false)]
+    camera: String,
+    /// The site whose world tracks are meant
+    #[param(required = false)]
+    site: String,
+    /// From this instant on (RFC 3339)
+    #[param(required = false, format = DateTime)]
+    from: String,
+    /// Before this instant (RFC 3339)
+    #[param(required = false, format = DateTime)]
+    until: String,
+    /// Only within `west,south,east,north`, degrees; west is greater than east across the antimeridian
+    #[param(required = false)]
+    bbox: String,
+    /// Only targets of this class
+    #[param(required = false)]
+    class: String,
+    /// Only this target
+    #[param(required = false)]
+    target_id: String,
+    /// Only the target that carries this receiver
+    #[param(required = false)]
+    receiver_id: String,
+    /// Only this track
+    #[param(required = false)]
+    track_id: String,
+}
+
 /// The scope and the selection of a request.
 pub(super) fn selection(params: &mut Params) -> Result<(TrackScope, HistorySelection)> {
     let scope = scope_of(params)?.ok_or_else(|| Error::invalid("site", "give either site or camera"))?;
@@ -155,15 +189,7 @@ struct HistoryPage<'a> {
 #[utoipa::path(
     get, path = "/v1/history", tag = "history",
     params(
-        ("camera" = Option<String>, Query, description = "The camera whose tracks are listed; either this or `site`"),
-        ("site" = Option<String>, Query, description = "The site whose world tracks are listed"),
-        ("from" = Option<String>, Query, format = DateTime, description = "From this instant on (RFC 3339)"),
-        ("until" = Option<String>, Query, format = DateTime, description = "Before this instant (RFC 3339)"),
-        ("bbox" = Option<String>, Query, description = "Only within `west,south,east,north`, degrees; west is greater than east across the antimeridian"),
-        ("class" = Option<String>, Query, description = "Only targets of this class"),
-        ("target_id" = Option<String>, Query, description = "Only this target"),
-        ("receiver_id" = Option<String>, Query, description = "Only the target that carries this receiver"),
-        ("track_id" = Option<String>, Query, description = "Only this track"),
+        SelectionParams,
         ("format" = inline(Option<HistoryFormat>), Query, description = "`json` if left out"),
         ("origin" = Option<String>, Query, description = "`longitude,latitude` in degrees, from which `mot` counts x to the east and y to the north, m"),
         ("frame_hz" = Option<f64>, Query, description = "Frames per second of `mot`, of which frame 1 is at `from`"),
@@ -325,17 +351,7 @@ struct DeletedHistory {
 /// finished are kept when they do.
 #[utoipa::path(
     delete, path = "/v1/history", tag = "history",
-    params(
-        ("camera" = Option<String>, Query, description = "The camera whose history is deleted; either this or `site`"),
-        ("site" = Option<String>, Query, description = "The site whose history is deleted"),
-        ("from" = Option<String>, Query, format = DateTime, description = "From this instant on (RFC 3339)"),
-        ("until" = Option<String>, Query, format = DateTime, description = "Before this instant (RFC 3339)"),
-        ("bbox" = Option<String>, Query, description = "Only within `west,south,east,north`, degrees"),
-        ("class" = Option<String>, Query, description = "Only targets of this class"),
-        ("target_id" = Option<String>, Query, description = "Only this target"),
-        ("receiver_id" = Option<String>, Query, description = "Only the target that carries this receiver"),
-        ("track_id" = Option<String>, Query, description = "Only this track"),
-    ),
+    params(SelectionParams),
     responses(
         (status = 200, description = "They are deleted", body = DeletedHistory),
         (status = 404, description = "No such camera or site", body = Problem, content_type = "application/problem+json"),

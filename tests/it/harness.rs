@@ -108,6 +108,10 @@ impl TestServer {
     pub(crate) fn start_with(folder: &Path, settings: &[(&str, &str)]) -> Self {
         let mut command = sightfix();
         command.args(["serve", "--listen", "127.0.0.1:0"]).args(store_arguments(folder));
+        // With PostgreSQL no data folder is stated, in which the archive would be.
+        if std::env::var_os("SIGHTFIX_TEST_POSTGRES").is_some() {
+            command.env("SIGHTFIX_ARCHIVE", folder.join("archive"));
+        }
         command.envs(settings.iter().copied()).stdout(Stdio::null());
         Self::run(command)
     }

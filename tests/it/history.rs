@@ -1,5 +1,7 @@
 //! The history of finished tracks: kept, queried on both transports, exported, deleted, and whole after a kill.
 
+use std::time::Duration;
+
 use jiff::{SignedDuration, Timestamp};
 use serde_json::{Value, json};
 use sightfix::grpc::proto;
@@ -265,6 +267,13 @@ async fn coarse_positions_lie_on_a_grid_and_state_its_error() {
     assert!(variance > 833.0, "{variance}");
 }
 
+/// With PostgreSQL a camera is its killed node's for the time of a lease.
+async fn wait_for_camera(server: &TestServer) {
+    while !server.get("/v1/cameras/gate/tracks").await.status.is_success() {
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}
+
 /// A track that goes on after more than a minute is another track: the one before has finished.
 #[tokio::test]
 async fn a_kill_loses_no_finished_track_that_was_written_and_leaves_only_whole_files() {
@@ -275,6 +284,7 @@ async fn a_kill_loses_no_finished_track_that_was_written_and_leaves_only_whole_f
         if round == 0 {
             create_camera(&server, &json!({})).await;
         }
+        wait_for_camera(&server).await;
         let before = items(&server, "camera=gate&limit=1000").await.len();
         assert!(before >= kept, "{before} of {kept} positions");
         let begin = start() - SignedDuration::from_hours(24 - round);
@@ -283,7 +293,7 @@ async fn a_kill_loses_no_finished_track_that_was_written_and_leaves_only_whole_f
         }
         // Some of what finished is written, and the kill comes while the rest is.
         while items(&server, "camera=gate&limit=1000").await.len() == before {
-            tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+            tokio::time::sleep(Duration::from_millis(20)).await;
         }
         kept = items(&server, "camera=gate&limit=1000").await.len();
         server.kill();
@@ -299,7 +309,7 @@ async fn a_kill_loses_only_the_end_of_a_track_that_goes_on() {
     create_camera(&server, &json!({})).await;
     walk(&server, "ann", start(), 300).await;
     while items(&server, "camera=gate&limit=1000").await.len() < 300 - 30 {
-        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+        tokio::time::sleep(Duration::from_millis(20)).await;
     }
     server.kill();
     let server = TestServer::start(folder.path());

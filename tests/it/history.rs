@@ -251,6 +251,35 @@ async fn a_deletion_leaves_nothing_of_a_receivers_carrier() {
     }
 }
 
+/// The site's cameras say who carries a receiver.
+#[tokio::test]
+async fn a_site_finds_and_deletes_a_receivers_carrier() {
+    let folder = data_folder();
+    let server = TestServer::start(folder.path());
+    server.post("/v1/sites", &json!({"id": "yard", "history": {}})).await.expect(201);
+    let receivers = json!([{"receiver_id": "phone-7", "target_id": "ann"}]);
+    let camera = json!({"id": "gate", "site": "yard", "receivers": receivers});
+    server.post("/v1/cameras", &camera).await.expect(201);
+    let fix = |second: i64| {
+        let time = now() - SignedDuration::from_secs(40 - second);
+        let position =
+            json!({"longitude_deg": 8.0 + 1.5e-5 * second as f64, "latitude_deg": 47.0, "sigma_m": 0.5});
+        json!({"time": time.to_string(), "receiver_id": "phone-7", "fix": position})
+    };
+    let observations: Vec<Value> = (0..40).map(fix).collect();
+    server.post("/v1/cameras/gate/tracks", &json!({"observations": observations})).await.expect(200);
+    assert!(server.terminate());
+    let server = TestServer::start(folder.path());
+    let all = items(&server, "site=yard&limit=1000").await;
+    assert!(all.len() > 30 && all[0]["target_id"] == "ann", "{all:?}");
+    assert_eq!(items(&server, "site=yard&limit=1000&receiver_id=phone-7").await, all);
+    assert!(items(&server, "site=yard&receiver_id=phone-8").await.is_empty());
+    let path = "/v1/history?site=yard&receiver_id=phone-7";
+    let deleted = server.send("DELETE", path, &[], "").await.expect(200).json();
+    assert_eq!(deleted, json!({ "deleted": all.len() }));
+    assert!(items(&server, "site=yard").await.is_empty());
+}
+
 #[tokio::test]
 async fn coarse_positions_lie_on_a_grid_and_state_its_error() {
     let folder = data_folder();

@@ -1,6 +1,6 @@
 //! The archive as a whole: files of positions under the folders of scope, day and hour.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind as IoErrorKind;
 use std::ops::{ControlFlow, Range};
 use std::path::{Path as FilePath, PathBuf};
@@ -131,6 +131,19 @@ impl Archive {
             }
         }
         Ok(())
+    }
+
+    /// The tracks that have rows of a selection.
+    ///
+    /// # Errors
+    /// As [`Archive::scan`].
+    pub fn tracks(&self, scope: &TrackScope, selection: &Selection) -> Result<BTreeSet<String>> {
+        let mut tracks = BTreeSet::new();
+        self.scan(scope, selection, None, |row| {
+            tracks.insert(row.track);
+            ControlFlow::Continue(())
+        })?;
+        Ok(tracks)
     }
 
     /// Deletes the rows of a selection in every file, and returns their number. Files without any other row vanish.

@@ -225,7 +225,8 @@ fn may_contain(group: &RowGroupMetaData, selection: &Selection) -> bool {
         && selection.class.as_ref().is_none_or(|class| may_have(columns::CLASS, class.as_str()))
         && selection.track.as_ref().is_none_or(|track| may_have(columns::TRACK, track))
         && (selection.targets.is_empty()
-            || selection.targets.iter().any(|target| may_have(columns::TARGET, target.as_str())))
+            || selection.targets.iter().any(|target| may_have(columns::TARGET, target.as_str()))
+            || selection.tracks_of_targets.iter().any(|track| may_have(columns::TRACK, track)))
 }
 
 /// False if a column has no such text. A column in which no row has a value states no bounds.

@@ -1,5 +1,7 @@
 //! Which rows are wanted.
 
+use std::collections::BTreeSet;
+
 use jiff::Timestamp;
 
 use crate::domain::{ArchivedPosition, Error, Result, TargetClass, TargetId};
@@ -60,6 +62,8 @@ pub struct Selection {
     pub class: Option<TargetClass>,
     /// Of one of these targets; empty for all.
     pub targets: Vec<TargetId>,
+    /// With targets: rows without a target are wanted too if they are of these tracks, whose target was known later.
+    pub tracks_of_targets: BTreeSet<String>,
     /// Of this track.
     pub track: Option<String>,
 }
@@ -71,7 +75,11 @@ impl Selection {
             && self.until.is_none_or(|until| row.time < until)
             && self.area.is_none_or(|it| it.contains(position.longitude_deg(), position.latitude_deg()))
             && self.class.as_ref().is_none_or(|class| row.class.as_ref() == Some(class))
-            && (self.targets.is_empty() || row.target.as_ref().is_some_and(|it| self.targets.contains(it)))
+            && (self.targets.is_empty()
+                || match &row.target {
+                    Some(target) => self.targets.contains(target),
+                    None => self.tracks_of_targets.contains(&row.track),
+                })
             && self.track.as_ref().is_none_or(|track| row.track == *track)
     }
 }

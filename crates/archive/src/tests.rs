@@ -167,6 +167,25 @@ fn conditions_select_rows() {
 }
 
 #[test]
+fn a_target_is_found_in_the_rows_of_its_track_from_before_it_was_known() {
+    let Folder { archive, .. } = &Folder::new();
+    let unknown =
+        |target| rows(target, 0..50).into_iter().map(|row| ArchivedPosition { target: None, ..row });
+    archive.write(&gate(), unknown("ann").chain(unknown("van")).collect()).expect("written");
+    archive.write(&gate(), [rows("ann", 50..60), rows("bob", 0..60)].concat()).expect("written");
+    let of_target =
+        Selection { targets: vec![TargetId::new("ann").expect("a name")], ..Selection::default() };
+    assert_eq!(found(archive, &of_target).len(), 10);
+    let tracks_of_targets = archive.tracks(&gate(), &of_target).expect("readable");
+    let of_tracks = Selection { tracks_of_targets, ..of_target };
+    let before = Selection { until: Some(time(50)), ..of_tracks.clone() };
+    let expected: Vec<_> = (0..50).map(|second| ("ann-1".to_owned(), second)).collect();
+    assert_eq!(found(archive, &before), expected);
+    assert_eq!(archive.delete(&gate(), &of_tracks).expect("deleted"), 60);
+    assert_eq!(found(archive, &Selection::default()).len(), 50 + 60);
+}
+
+#[test]
 fn a_deletion_leaves_no_row_in_any_file() {
     let it = Folder::new();
     let archive = &it.archive;

@@ -14,12 +14,16 @@ use crate::domain::{
     ArchivedPosition, Error, ErrorKind, HistoryKey, ReceiverId, Result, TargetClass, TargetId, TrackScope,
 };
 use crate::store::Store;
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 
 /// Rows that are handed over at once.
 const BATCH: usize = 1_024;
 /// Batches that wait for a slow reader.
 const WAITING: usize = 4;
+/// Cameras of a site that are read at a time.
+const CAMERAS: u32 = 1_000;
+/// The time after the end of a query in which the target of a track that it has no target of is looked for.
+const IDENTIFIED_WITHIN: SignedDuration = SignedDuration::from_hours(1);
 
 /// Which positions of a camera or a site are asked for.
 #[derive(Debug, Clone, Default)]
@@ -91,8 +95,9 @@ impl History<'_> {
         after: Option<HistoryKey>,
         limit: u32,
     ) -> Result<Page<ArchivedPosition, HistoryKey>> {
-        let selection = self.selected(&scope, selection).await?;
+        let mut selection = self.selected(&scope, selection).await?;
         let rows = on_archive(self.archive()?, move |archive| {
+            add_tracks(archive, &scope, &mut selection, Some(IDENTIFIED_WITHIN))?;
             let mut rows = Vec::new();
             archive.scan(&scope, &selection, after, |row| {
                 rows.push(row);
@@ -109,10 +114,10 @@ impl History<'_> {
     /// # Errors
     /// As [`History::page`].
     pub async fn rows(&self, scope: TrackScope, selection: HistorySelection) -> Result<HistoryRows> {
-        let selection = self.selected(&scope, selection).await?;
+        let mut selection = self.selected(&scope, selection).await?;
         let archive = self.archive()?.clone();
         let (sender, batches) = mpsc::channel(WAITING);
-        tokio::task::spawn_blocking(move || send_rows(&archive, &scope, &selection, &sender));
+        tokio::task::spawn_blocking(move || send_rows(&archive, &scope, &mut selection, &sender));
         Ok(HistoryRows { batches })
     }
 
@@ -121,9 +126,13 @@ impl History<'_> {
     /// # Errors
     /// As [`History::page`].
     pub async fn delete(&self, scope: TrackScope, selection: HistorySelection) -> Result<u64> {
-        let selection = self.selected(&scope, selection).await?;
+        let mut selection = self.selected(&scope, selection).await?;
         self.archived.flush().await;
-        on_archive(self.archive()?, move |archive| archive.delete(&scope, &selection)).await
+        on_archive(self.archive()?, move |archive| {
+            add_tracks(archive, &scope, &mut selection, None)?;
+            archive.delete(&scope, &selection)
+        })
+        .await
     }
 
     fn archive(&self) -> Result<&Archive> {
@@ -140,31 +149,65 @@ impl History<'_> {
         if target.is_some() && receiver.is_some() {
             return Err(Error::invalid("receiver_id", "is not possible beside target_id"));
         }
-        let receivers = match scope {
-            TrackScope::Camera(id) => Some(self.cameras.get(id).await?),
-            TrackScope::Site(id) => {
-                self.store.site(id).await?;
-                None
-            }
+        match scope {
+            TrackScope::Camera(id) => drop(self.cameras.get(id).await?),
+            TrackScope::Site(id) => drop(self.store.site(id).await?),
+        }
+        let targets = match receiver {
+            Some(receiver) => self.carriers(scope, &receiver).await?,
+            None => target.into_iter().collect(),
         };
-        let carrier = receiver.and_then(|receiver| {
-            let camera = receivers.as_ref();
-            let declared = camera.and_then(|camera| camera.receivers.get(&receiver));
-            declared.map(|own| own.target_id.clone()).or_else(|| TargetId::new(receiver.as_str()).ok())
-        });
-        let targets = target.or(carrier).into_iter().collect();
-        Ok(Selection { from, until, area, class, targets, track })
+        Ok(Selection { from, until, area, class, targets, track, ..Selection::default() })
     }
+
+    /// The targets that carry a receiver: those that the camera, or cameras of the site, declare, and the one of the
+    /// receiver's own name, which it has where no camera declares it.
+    async fn carriers(&self, scope: &TrackScope, receiver: &ReceiverId) -> Result<Vec<TargetId>> {
+        let mut carriers = vec![TargetId::new(receiver.as_str()).map_err(|error| error.at("receiver_id"))?];
+        match scope {
+            TrackScope::Camera(id) => {
+                let camera = self.cameras.get(id).await?;
+                carriers.extend(camera.receivers.get(receiver).map(|own| own.target_id.clone()));
+            }
+            TrackScope::Site(id) => {
+                let mut page = self.store.cameras(Some(id), None, CAMERAS).await?;
+                while let Some(last) = page.last().map(|camera| camera.id().clone()) {
+                    let declared = page.iter().filter_map(|camera| camera.profile.receivers.get(receiver));
+                    carriers.extend(declared.map(|own| own.target_id.clone()));
+                    page = self.store.cameras(Some(id), Some(&last), CAMERAS).await?;
+                }
+            }
+        }
+        Ok(carriers)
+    }
+}
+
+/// Adds the tracks whose target was known only after their first rows were written, within a time of them where one is
+/// stated. A camera's tracks have a target from the beginning.
+fn add_tracks(
+    archive: &Archive,
+    scope: &TrackScope,
+    selection: &mut Selection,
+    within: Option<SignedDuration>,
+) -> Result<()> {
+    if !selection.targets.is_empty() && scope.site().is_some() {
+        let until = within.and_then(|within| selection.until?.checked_add(within).ok());
+        let (from, targets) = (selection.from, selection.targets.clone());
+        let later = Selection { from, until, targets, ..Selection::default() };
+        selection.tracks_of_targets = archive.tracks(scope, &later)?;
+    }
+    Ok(())
 }
 
 fn send_rows(
     archive: &Archive,
     scope: &TrackScope,
-    selection: &Selection,
+    selection: &mut Selection,
     sender: &mpsc::Sender<Result<Vec<ArchivedPosition>>>,
 ) {
     let mut batch = Vec::with_capacity(BATCH);
-    let scanned = archive.scan(scope, selection, None, |row| {
+    let found = add_tracks(archive, scope, selection, Some(IDENTIFIED_WITHIN));
+    let mut send_row = |row| {
         batch.push(row);
         if batch.len() < BATCH {
             return ControlFlow::Continue(());
@@ -176,7 +219,8 @@ fn send_rows(
         } else {
             ControlFlow::Continue(())
         }
-    });
+    };
+    let scanned = found.and_then(|()| archive.scan(scope, selection, None, &mut send_row));
     // The reader may have gone.
     let _ = sender.blocking_send(scanned.map(|()| batch));
 }

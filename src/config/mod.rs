@@ -78,8 +78,8 @@ pub struct Config {
     /// Folder below which sinks of connections write files (`file:`), each in a folder of its own; without it there are
     /// no such sinks.
     pub export_folder: Option<PathBuf>,
-    /// Where finished tracks of cameras and sites with a history are kept: a folder, or the URL of an object store such as
-    /// `s3://bucket/prefix`; by default the folder `archive` in `data`.
+    /// Where finished tracks of cameras and sites with a history are kept: a folder, or a bucket of an object store as
+    /// `s3://bucket/prefix` (docs/howto/history.md); by default the folder `archive` in `data`.
     pub archive: Option<String>,
     /// Serial devices that sources of connections may read (`serial:`), as their addresses name them.
     pub serial_devices: Vec<PathBuf>,

@@ -5,14 +5,16 @@ use std::io::ErrorKind as IoErrorKind;
 use std::ops::{ControlFlow, Range};
 use std::path::{Path as FilePath, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::TryStreamExt as _;
 use jiff::Timestamp;
+use object_store::aws::AmazonS3Builder;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 use object_store::prefix::PrefixStore;
-use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _};
+use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt as _, RetryConfig};
 use tokio::runtime::Handle;
 
 use crate::domain::{ArchivedPosition, CameraId, Error, HistoryKey, Result, SiteId, TrackScope};
@@ -29,21 +31,24 @@ const SMALL_BYTES: u64 = 16 << 20;
 const SMALL_FILES: usize = 16;
 /// How often an hour is read again whose files were replaced meanwhile.
 const ATTEMPTS: u32 = 8;
+/// Time in which a request to a bucket is repeated. Finished tracks wait for the next attempt to write them.
+const RETRY_TIME: Duration = Duration::from_secs(5);
 
 /// Where an archive is.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Location {
     /// In a folder of this machine.
     Folder(PathBuf),
-    /// In an object store: the URL of a bucket and a prefix in it, such as `s3://bucket/prefix`.
-    Url(String),
+    /// In a store that speaks the protocol of S3: a bucket and a prefix in it, as `s3://bucket/prefix`. Its address and keys
+    /// are those of the variables `AWS_*` of the environment.
+    Bucket(String),
 }
 
 impl Location {
     /// A folder, or a URL.
     #[must_use]
     pub fn new(text: &str) -> Self {
-        if text.contains("://") { Self::Url(text.to_owned()) } else { Self::Folder(text.into()) }
+        if text.contains("://") { Self::Bucket(text.to_owned()) } else { Self::Folder(text.into()) }
     }
 }
 
@@ -75,7 +80,7 @@ impl Archive {
     ) -> Result<Self> {
         let store = match location {
             Location::Folder(folder) => open_folder(folder)?,
-            Location::Url(url) => open_url(url)?,
+            Location::Bucket(url) => open_bucket(url)?,
         };
         Ok(Self(Arc::new(Parts { store, runtime, new_name: Box::new(new_name), changing: Mutex::new(()) })))
     }
@@ -376,19 +381,24 @@ fn open_folder(folder: &FilePath) -> Result<Box<dyn ObjectStore>> {
     Ok(Box::new(store.with_fsync(true).with_automatic_cleanup(true)))
 }
 
-fn open_url(url: &str) -> Result<Box<dyn ObjectStore>> {
+fn open_bucket(url: &str) -> Result<Box<dyn ObjectStore>> {
     let refused = |error: &dyn std::fmt::Display| {
         let message = format!(
-            "cannot be used as the place of the archive: {error}; name a folder, or the URL of a store that this program \
-             was built for (s3:// needs the feature `s3`)"
+            "cannot be used as the place of the archive: {error}; name a folder, or s3://bucket/prefix with AWS_ACCESS_KEY_ID \
+             and the other variables of the environment"
         );
         Error::invalid("archive", message)
     };
     let parsed = url::Url::parse(url).map_err(|error| refused(&error))?;
-    let from_environment = std::env::vars().filter(|(name, _)| name.starts_with("AWS_"));
-    let options = from_environment.map(|(name, value)| (name.to_ascii_lowercase(), value));
-    let (store, prefix) = object_store::parse_url_opts(&parsed, options).map_err(|error| refused(&error))?;
-    Ok(Box::new(PrefixStore::new(store, prefix)))
+    if parsed.scheme() != "s3" {
+        return Err(refused(&format!("{}:// is not supported", parsed.scheme())));
+    }
+    let prefix = Path::from_url_path(parsed.path()).map_err(|error| refused(&error))?;
+    // The client takes the provider of the process; another one that is there already serves as well.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    let retry = RetryConfig { max_retries: 3, retry_timeout: RETRY_TIME, ..RetryConfig::default() };
+    let bucket = AmazonS3Builder::from_env().with_url(url).with_retry(retry).build();
+    Ok(Box::new(PrefixStore::new(bucket.map_err(|error| refused(&error))?, prefix)))
 }
 
 /// Removes what was being written when the process was killed.

@@ -116,6 +116,11 @@ class Node:
         if self._process is not None:
             self._process.signal(SIGCONT)
 
+    def slow_flushes(self, delay_s: float, duration_s: float) -> None:
+        """Makes its disk slow for a while."""
+        if self._process is not None:
+            self._process.slow_flushes(delay_s, duration_s)
+
     def set_clock(self, offset_s: float) -> None:
         """Sets its wall clock ahead of or behind the machine's; seen within a second."""
         new = self._clock.with_suffix(".new")

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import random
+import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -22,6 +23,8 @@ DURATIONS_S = (0.2, 4.0)
 #: Ahead of or behind the machine's clock, s.
 CLOCK_OFFSETS_S = (-86_400.0, -3_600.0, -30.0, -2.0, 2.0, 30.0, 3_600.0, 86_400.0, 400 * 86_400.0)
 DELAYS_S = (0.01, 0.05, 0.2)
+#: How much longer a flush takes on a slow disk, s.
+SLOW_FLUSHES_S = (0.02, 0.1, 0.5)
 #: For how long before a fail-over an asynchronous standby has received nothing, s.
 LAGS_S = (0.0, 0.5, 1.5)
 
@@ -31,7 +34,7 @@ ON_DATABASE = ("database-kill", "database-stop", "database-terminate")
 #: Faults that may end a lease.
 ENDS_LEASES = ("node-kill", "node-stop", "node-restart", "rolling-restart", "database-cut", "database-delay",
                "database-kill", "database-stop", "database-terminate", "database-reset", "full-disk",
-               "fail-over")  # fmt: skip
+               "fail-over", "slow-disk")  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +81,7 @@ def amount_of(kind: str, chance: random.Random) -> float:
         "clients-delay": DELAYS_S,
         "database-delay": DELAYS_S,
         "fail-over": LAGS_S,
+        "slow-disk": SLOW_FLUSHES_S,
     }
     return chance.choice(amounts.get(kind, (0.0,)))
 
@@ -90,6 +94,8 @@ def kinds_for(cluster: Cluster, has_clock: bool) -> list[str]:
         kinds.append("rolling-restart")
     if backend.disk.is_own:
         kinds.append("full-disk")
+        if shutil.which("strace"):
+            kinds.append("slow-disk")
     if isinstance(backend, PostgreSQL):
         kinds += [*ON_LINKS_TO_DATABASE, *ON_DATABASE]
         if backend.standby is not None:
@@ -114,6 +120,7 @@ class Nemesis:
             "database-cut": self._cut, "database-reset": self._reset, "database-delay": self._delay,
             "database-kill": self._database_kill, "database-stop": self._database_stop,
             "database-terminate": self._database_terminate, "fail-over": self._fail_over,
+            "slow-disk": self._slow_disk,
         }  # fmt: skip
 
     def run(self, faults: list[Fault]) -> None:
@@ -159,6 +166,8 @@ class Nemesis:
         node = self._node(fault).name
         if fault.kind in ON_DATABASE or fault.kind in ("full-disk", "fail-over"):
             return {"database"}
+        if fault.kind == "slow-disk":
+            return {"database"} if isinstance(self._cluster.backend, PostgreSQL) else {"database", node}
         if fault.kind == "rolling-restart":
             return {one.name for one in self._cluster.nodes}
         if fault.kind.startswith("clients-"):
@@ -212,6 +221,11 @@ class Nemesis:
         disk.free()
         if isinstance(self._cluster.backend, PostgreSQL):
             self._postgres.keep_running()
+
+    def _slow_disk(self, fault: Fault) -> None:
+        postgres = isinstance(self._cluster.backend, PostgreSQL)
+        writer = self._postgres.primary.process if postgres else self._node(fault)
+        writer.slow_flushes(fault.amount, fault.duration_s)
 
     def _cut(self, fault: Fault) -> None:
         self._cluster.network.set(self._link(fault), is_cut=True)

@@ -72,6 +72,27 @@ class Process:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._child.pid, number)
 
+    def slow_flushes(self, delay_s: float, duration_s: float) -> None:
+        """Makes each of its flushes to the disk take so much longer, and those of its children, for a while.
+
+        Raises:
+            HarnessError: It cannot be traced.
+        """
+        children = subprocess.run(["pgrep", "-P", str(self.id)], capture_output=True, text=True, check=False)
+        traced = [part for number in [str(self.id), *children.stdout.split()] for part in ("-p", number)]
+        delay = f"inject=fsync,fdatasync:delay_enter={round(delay_s * 1e6)}"
+        command = ["strace", "-qq", "-f", "-o", "/dev/null", "-e", "trace=fsync,fdatasync", "-e", delay, *traced]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as tracer:
+            try:
+                _, reason = tracer.communicate(timeout=duration_s)
+            except subprocess.TimeoutExpired:
+                tracer.terminate()
+                tracer.communicate()
+            else:
+                # It has ended before, with the process or for want of a right.
+                if self.exit_code() is None:
+                    raise HarnessError(f"strace cannot follow process {self.id}: {reason.strip()}")
+
     def kill(self) -> None:
         """Ends it at once."""
         self.signal(signal.SIGKILL)

@@ -86,13 +86,25 @@ def pages(api: Api, path: str) -> list[dict[str, Any]]:
     cursor = ""
     while True:
         separator = "&" if "?" in path else "?"
-        page = api.send("page", path, "GET", f"{path}{separator}limit=1000{cursor}", keep=lambda answer, _: answer)
-        if not page.is_done:
-            raise HarnessError(f"{path}: {page.status} {page.answer}")
-        items += page.answer["items"]
-        if not page.answer.get("next_cursor"):
+        answer = page_of(api, f"{path}{separator}limit=1000{cursor}")
+        items += answer["items"]
+        if not answer.get("next_cursor"):
             return items
-        cursor = f"&cursor={page.answer['next_cursor']}"
+        cursor = f"&cursor={answer['next_cursor']}"
+
+
+def page_of(api: Api, path: str) -> Any:
+    """An answer, asked for again as long as a node cannot give it: on a busy machine one may lose its lease.
+
+    Raises:
+        HarnessError: It does not come.
+    """
+    end = time.monotonic() + END_S
+    while not (page := api.send("page", path, "GET", path, keep=lambda answer, _: answer)).is_done:
+        if time.monotonic() > end:
+            raise HarnessError(f"{path}: {page.status} {page.answer}")
+        time.sleep(1.0)
+    return page.answer
 
 
 def read_final_state(cluster: Cluster, ways: Ways, folder: Path) -> None:

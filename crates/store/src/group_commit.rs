@@ -105,9 +105,16 @@ pub(super) struct SampleBatch {
 
 impl GroupCommit {
     pub(super) fn start(writer: Arc<dyn SampleWriter>) -> Self {
+        let (queue, task) = Self::new(writer);
+        tokio::spawn(task);
+        queue
+    }
+
+    /// The queue, and the task that empties it.
+    pub(super) fn new(writer: Arc<dyn SampleWriter>) -> (Self, impl Future<Output = ()> + Send + 'static) {
         let (queue, requests) = mpsc::channel(QUEUE);
-        tokio::spawn(run(writer, requests));
-        Self { queue, rows: Arc::new(Semaphore::new(ROWS_IN_FLIGHT as usize)) }
+        let rows = Arc::new(Semaphore::new(ROWS_IN_FLIGHT as usize));
+        (Self { queue, rows }, run(writer, requests))
     }
 
     pub(super) async fn insert(

@@ -6,7 +6,7 @@ fn offset(topic: &str, partition: i32, next_offset: i64) -> SourceOffset {
     SourceOffset { topic: topic.to_owned(), partition, next_offset }
 }
 
-async fn insert(store: &Store, name: &str) -> Connection {
+pub(super) async fn insert(store: &Store, name: &str) -> Connection {
     let profile = NewConnection {
         id: ConnectionId::new(name).expect("a slug"),
         display_name: name.to_owned(),

@@ -12,6 +12,7 @@ mod places;
 mod recordings;
 mod runs;
 mod samples;
+mod schedules;
 mod site_runs;
 
 use std::sync::Arc;

@@ -5,6 +5,8 @@
 //! database: samples and alarms go there by tasks of their own. What an outside client can make large is
 //! bounded by the limits.
 
+#[cfg(test)]
+mod acknowledgement_schedules;
 mod acknowledgements;
 mod alarms;
 pub(super) mod camera;

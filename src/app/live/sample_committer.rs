@@ -6,16 +6,38 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 
 use super::sample_recorder::{Commit, SampleRecorder};
-use crate::domain::{CameraId, CameraKey, Error, Result};
-use crate::store::Store;
+use crate::domain::{CameraId, CameraKey, Durability, Error, Result, Sample};
+use crate::store::{Inserted, Store};
 use crate::telemetry::Metrics;
 
 /// How often silent targets are looked for.
 const TICK: Duration = Duration::from_secs(1);
 
+/// What stores the samples of a camera.
+pub(super) trait SampleStore: Send + Sync + 'static {
+    /// As [`Store::insert_samples_of`].
+    fn insert(
+        &self,
+        camera: (&CameraId, CameraKey),
+        samples: Vec<Sample>,
+        durability: Durability,
+    ) -> impl Future<Output = Result<Inserted>> + Send;
+}
+
+impl SampleStore for Store {
+    async fn insert(
+        &self,
+        (id, key): (&CameraId, CameraKey),
+        samples: Vec<Sample>,
+        durability: Durability,
+    ) -> Result<Inserted> {
+        self.insert_samples_of(id, key, samples, durability).await
+    }
+}
+
 /// Where samples go.
-pub(super) struct SampleSink {
-    pub(super) store: Store,
+pub(super) struct SampleSink<S> {
+    pub(super) store: S,
     pub(super) metrics: Metrics,
     pub(super) id: CameraId,
     pub(super) key: CameraKey,
@@ -25,11 +47,13 @@ pub(super) struct SampleSink {
 pub(super) async fn commit_all(
     recorder: Weak<SampleRecorder>,
     mut queue: mpsc::Receiver<Commit>,
-    sink: SampleSink,
+    sink: SampleSink<impl SampleStore>,
 ) {
     let mut tick = tokio::time::interval(TICK);
     loop {
         let mut commit = tokio::select! {
+            // A tick decides nothing as long as the queue is not empty.
+            biased;
             commit = queue.recv() => match commit {
                 Some(commit) => commit,
                 None => return,
@@ -49,13 +73,13 @@ pub(super) async fn commit_all(
     }
 }
 
-impl SampleSink {
+impl<S: SampleStore> SampleSink<S> {
     async fn store(&self, commit: Commit) -> Result<()> {
         let Commit { samples, released, .. } = commit;
         if !samples.is_empty() {
             // Streams share a commit: the strongest durability that one of them asks for holds for all of it.
             let durability = released.iter().map(|item| item.tag.durability()).max().unwrap_or_default();
-            match self.store.insert_samples_of(&self.id, self.key, samples, durability).await {
+            match self.store.insert((&self.id, self.key), samples, durability).await {
                 Ok(inserted) => self.metrics.imported(inserted.accepted, inserted.duplicate, 0),
                 Err(error) => {
                     released.iter().for_each(|item| item.tag.fail(error.kind()));
@@ -84,7 +108,7 @@ impl SampleSink {
 
 /// Starts a recorder with its task; `spawn` runs the task until it ends by itself.
 pub(super) fn start(
-    sink: SampleSink,
+    sink: SampleSink<impl SampleStore>,
     spawn: impl FnOnce(std::pin::Pin<Box<dyn Future<Output = ()> + Send>>),
 ) -> Arc<SampleRecorder> {
     let (recorder, queue) = SampleRecorder::new();
@@ -96,7 +120,6 @@ pub(super) fn start(
 mod tests {
     use super::super::acknowledgements::AckTracker;
     use super::*;
-    use crate::domain::Durability;
     use crate::simulation::{Options, simulate};
 
     #[tokio::test]

@@ -3,6 +3,9 @@
 //! A request reads the map that is current at that moment; a change replaces it. Reading never waits for
 //! the database.
 
+#[cfg(test)]
+mod schedules;
+
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -28,6 +31,25 @@ const SHOWN_AT_ONCE: usize = 4_096;
 /// A refresh reads what has changed since the one before. One in this number of refreshes compares all cameras, since a
 /// server that was restored, copied or replaced may not tell all of its changes.
 const REFRESHES_OF_CHANGES: u32 = 150;
+
+/// Where cameras are stored.
+pub trait CameraSource: Sync {
+    /// As [`Store::camera_versions`].
+    fn versions(&self, since: Option<ChangeMark>) -> impl Future<Output = Result<CameraVersions>> + Send;
+
+    /// As [`Store::camera_contents`].
+    fn contents(&self, ids: &[CameraId]) -> impl Future<Output = Result<Vec<Result<CameraContent>>>> + Send;
+}
+
+impl CameraSource for Store {
+    async fn versions(&self, since: Option<ChangeMark>) -> Result<CameraVersions> {
+        self.camera_versions(since).await
+    }
+
+    async fn contents(&self, ids: &[CameraId]) -> Result<Vec<Result<CameraContent>>> {
+        self.camera_contents(ids).await
+    }
+}
 
 /// Everything that answers for one camera.
 #[derive(Clone)]
@@ -153,9 +175,13 @@ impl Registry {
     ///
     /// # Errors
     /// `CameraNotFound`; a fault if the store cannot be read.
-    pub async fn refresh_camera(&self, store: &Store, id: &CameraId) -> Result<Arc<ActiveCamera>> {
+    pub async fn refresh_camera(
+        &self,
+        store: &impl CameraSource,
+        id: &CameraId,
+    ) -> Result<Arc<ActiveCamera>> {
         let _change = self.change.lock().await;
-        let read = store.camera_contents(std::slice::from_ref(id)).await?.pop();
+        let read = store.contents(std::slice::from_ref(id)).await?.pop();
         let loaded = read.ok_or_else(|| Error::fault("the store answers for no camera"))?;
         let loaded =
             loaded.and_then(|content| self.load(content, self.is_distrusted.load(Ordering::Acquire)));
@@ -174,7 +200,7 @@ impl Registry {
     ///
     /// # Errors
     /// A fault if the store cannot be read.
-    pub async fn refresh(&self, store: &Store) -> Result<()> {
+    pub async fn refresh(&self, store: &impl CameraSource) -> Result<()> {
         let mut change = self.change.lock().await;
         let Refreshed { upto, of_changes } = std::mem::take(&mut *change);
         let is_distrusted = self.is_distrusted.swap(false, Ordering::AcqRel);
@@ -191,13 +217,13 @@ impl Registry {
     /// Until where this refresh has read; `None` if not every camera could be read.
     async fn refresh_since(
         &self,
-        store: &Store,
+        store: &impl CameraSource,
         upto: Option<ChangeMark>,
         of_changes: u32,
         is_distrusted: bool,
     ) -> Result<Option<Refreshed>> {
         let since = upto.filter(|_| of_changes < REFRESHES_OF_CHANGES && !is_distrusted);
-        let CameraVersions { versions, deleted, upto } = store.camera_versions(since).await?;
+        let CameraVersions { versions, deleted, upto } = store.versions(since).await?;
         let known = self.cameras.load_full();
         let deleted = deleted.unwrap_or_else(|| missing(&known, &versions));
         let is_known = |(id, key): &(CameraId, CameraKey)| known.get(id).is_some_and(|it| it.key == *key);
@@ -220,12 +246,12 @@ impl Registry {
 
     /// Loads cameras as they are stored, with models that are known already unless they are distrusted; whether all
     /// could be read.
-    async fn read(&self, store: &Store, ids: &[CameraId], is_distrusted: bool) -> Result<bool> {
+    async fn read(&self, store: &impl CameraSource, ids: &[CameraId], is_distrusted: bool) -> Result<bool> {
         let mut is_complete = true;
         for shown in ids.chunks(SHOWN_AT_ONCE) {
             let mut loaded = Vec::with_capacity(shown.len());
             for group in shown.chunks(READ_AT_ONCE) {
-                for (id, content) in group.iter().zip(store.camera_contents(group).await?) {
+                for (id, content) in group.iter().zip(store.contents(group).await?) {
                     match content.and_then(|content| self.load(content, is_distrusted)) {
                         Ok(camera) => loaded.push((id, Some(camera))),
                         Err(error) => {

@@ -293,7 +293,6 @@ CREATE TABLE idempotency_keys (
     created_at_us   BIGINT NOT NULL,
     UNIQUE (owner, idempotency_key)
 );
-CREATE INDEX idempotency_keys_by_age ON idempotency_keys (created_at_us);
 
 -- Training runs over all cameras of a site: jobs as training runs of a camera are, with the same rules for lease and
 -- fence. The report is JSON and stands last, so that reading all else never touches it.

@@ -318,8 +318,6 @@ CREATE TABLE idempotency_keys (
     UNIQUE (owner, idempotency_key)
 ) STRICT;
 
-CREATE INDEX idempotency_keys_by_age ON idempotency_keys (created_at_us);
-
 -- Connections with other systems. `settings` is JSON and never contains a secret; `secrets` is a JSON object of texts,
 -- which no interface shows.
 CREATE TABLE connections (

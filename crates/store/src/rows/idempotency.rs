@@ -1,9 +1,6 @@
 //! Rows of answers that are repeated.
 
-use jiff::{SignedDuration, Timestamp};
-
 use crate::domain::{Actor, Error, ErrorKind, IdempotencyKey, RequestDigest, Result};
-use crate::limits::StoreLimits;
 
 /// A request that its client may repeat.
 #[derive(Debug, Clone)]
@@ -43,10 +40,4 @@ impl StoredAnswer {
 pub(crate) fn owner(actor: &Actor) -> String {
     let key = actor.key_id.map(|id| id.to_string());
     key.or_else(|| actor.identity.as_deref().map(str::to_owned)).unwrap_or_default()
-}
-
-/// Keys of this time and before have expired.
-pub(crate) fn expired_until_us(limits: &StoreLimits, now: Timestamp) -> i64 {
-    let life = SignedDuration::from_secs(limits.idempotency_key_s.into());
-    now.saturating_sub(life).map_or(i64::MIN, Timestamp::as_microsecond)
 }

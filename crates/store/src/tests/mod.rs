@@ -6,6 +6,7 @@ mod connections;
 pub(super) mod copy;
 mod evaluations;
 pub(super) mod group;
+mod idempotency;
 mod keys;
 mod models;
 mod places;

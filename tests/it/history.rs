@@ -3,6 +3,7 @@
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
 use std::process::{Child, Command, Stdio};
+use std::sync::LazyLock;
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
@@ -31,10 +32,13 @@ async fn walk(server: &TestServer, target: &str, start: Timestamp, seconds: i64)
     server.post("/v1/cameras/gate/tracks", &json!({"observations": observations})).await.expect(200);
 }
 
-/// A minute ago on a full minute, so that times are easy to state.
+/// Ten minutes before the tests on a full minute, so that times are easy to state.
 fn start() -> Timestamp {
-    let second = now().as_second() - 600;
-    Timestamp::from_second(second - second.rem_euclid(60)).expect("in range")
+    static START: LazyLock<Timestamp> = LazyLock::new(|| {
+        let second = now().as_second() - 600;
+        Timestamp::from_second(second - second.rem_euclid(60)).expect("in range")
+    });
+    *START
 }
 
 async fn history(server: &TestServer, query: &str) -> Answer {

@@ -108,7 +108,7 @@ pub struct App {
 pub struct Parts {
     opened_store: Store,
     /// Profiles and active models, ready to answer.
-    pub registry: Registry,
+    pub registry: Arc<Registry>,
     /// Sites, ready to track.
     pub site_registry: SiteRegistry,
     /// The status of connections with other systems.
@@ -175,7 +175,7 @@ impl App {
     ) -> crate::domain::Result<Self> {
         let mut run_id = [0; 8];
         randomness.fill(&mut run_id);
-        let registry = Registry::of_run(u64::from_le_bytes(run_id));
+        let registry = Arc::new(Registry::of_run(u64::from_le_bytes(run_id)));
         let site_registry = SiteRegistry::new(randomness.clone(), limits.site_events);
         let access = Access::default();
         access.refresh(&store, &clock).await?;

@@ -4,7 +4,9 @@ use jiff::Timestamp;
 
 use super::JobQueue;
 use super::training::{Trainable, Training, TrainingQueues, check_extent};
-use crate::domain::{Camera, Error, ErrorKind, Result, SiteId, SiteTrainingOptions, TimeRange};
+use crate::domain::{
+    Camera, CameraId, Error, ErrorKind, Result, SiteId, SiteTrainingOptions, TimeRange, TrainingRun,
+};
 use crate::store::SampleFilter;
 
 /// Fewer cameras than this are not trained together.
@@ -40,6 +42,11 @@ impl Trainable for SiteId {
 
     fn queue(queues: &TrainingQueues) -> &JobQueue {
         &queues.sites
+    }
+
+    fn models_of(run: &TrainingRun<Self>) -> Vec<(CameraId, u32)> {
+        let cameras = run.report.iter().flat_map(|report| &report.cameras);
+        cameras.filter_map(|own| Some((CameraId::new(&own.camera_id).ok()?, own.model_version))).collect()
     }
 }
 

@@ -1,12 +1,13 @@
 //! Training runs: start, list, cancel, watch. `worker` runs them.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::{Stream, StreamExt as _, stream};
 use jiff::Timestamp;
 
 use super::idempotency::{first_answer, record_of};
-use super::{App, JobQueue, Page, page_of};
+use super::{App, JobQueue, Page, Registry, page_of};
 use crate::clock::{Clock, Randomness};
 use crate::config::Limits;
 use crate::domain::{
@@ -58,6 +59,9 @@ pub trait Trainable: RunSubject {
 
     /// Notifies the workers of its runs.
     fn queue(queues: &TrainingQueues) -> &JobQueue;
+
+    /// The versions of cameras' models that a run has stored, and may have activated.
+    fn models_of(run: &TrainingRun<Self>) -> Vec<(CameraId, u32)>;
 }
 
 impl Trainable for CameraId {
@@ -84,6 +88,10 @@ impl Trainable for CameraId {
     fn queue(queues: &TrainingQueues) -> &JobQueue {
         &queues.cameras
     }
+
+    fn models_of(run: &TrainingRun<Self>) -> Vec<(CameraId, u32)> {
+        run.model_version.map(|version| (run.subject.clone(), version)).into_iter().collect()
+    }
 }
 
 /// The use cases of training runs of cameras and sites.
@@ -94,6 +102,7 @@ pub struct Training<'a> {
     randomness: &'a Randomness,
     pub(super) limits: &'a Limits,
     queues: &'a TrainingQueues,
+    registry: &'a Arc<Registry>,
 }
 
 impl App {
@@ -106,6 +115,7 @@ impl App {
             randomness: &self.randomness,
             limits: &self.limits,
             queues: &self.training_queues,
+            registry: &self.registry,
         }
     }
 }
@@ -143,8 +153,8 @@ impl Training<'_> {
     ///
     /// # Errors
     /// `CameraNotFound` or `SiteNotFound`; `RunNotFound`.
-    pub async fn get<S: RunSubject>(&self, subject: &S, run: RunId) -> Result<TrainingRun<S>> {
-        self.store.run(subject, run).await
+    pub async fn get<S: Trainable>(&self, subject: &S, run: RunId) -> Result<TrainingRun<S>> {
+        read(self.store, self.registry, subject, run).await
     }
 
     /// Runs of a camera or a site, newest first, after a cursor.
@@ -200,26 +210,49 @@ impl Training<'_> {
     ///
     /// # Errors
     /// `CameraNotFound` or `SiteNotFound`; `RunNotFound` at once; a fault later ends the stream.
-    pub async fn watch<S: RunSubject>(
+    pub async fn watch<S: Trainable>(
         &self,
         subject: &S,
         run: RunId,
     ) -> Result<impl Stream<Item = Result<TrainingRun<S>>> + Send + use<S>> {
-        let first = self.store.run(subject, run).await?;
-        let watched = (Some(first.clone()), self.store.clone(), subject.clone());
-        let later = stream::unfold(watched, move |(shown, store, subject)| async move {
+        let first = self.get(subject, run).await?;
+        let (store, registry, subject) = (self.store.clone(), self.registry.clone(), subject.clone());
+        let watched = (Some(first.clone()), store, registry, subject);
+        let later = stream::unfold(watched, move |(shown, store, registry, subject)| async move {
             let shown = shown.filter(|run| !run.state.has_ended())?;
             loop {
                 tokio::time::sleep(WATCH_INTERVAL).await;
-                match store.run(&subject, run).await {
+                match read(&store, &registry, &subject, run).await {
                     Ok(seen) if seen == shown => {}
-                    Ok(seen) => return Some((Ok(seen.clone()), (Some(seen), store, subject))),
-                    Err(error) => return Some((Err(error), (None, store, subject))),
+                    Ok(seen) => return Some((Ok(seen.clone()), (Some(seen), store, registry, subject))),
+                    Err(error) => return Some((Err(error), (None, store, registry, subject))),
                 }
             }
         });
         Ok(stream::once(async move { Ok(first) }).chain(later))
     }
+}
+
+/// A run. The models that it has stored answer from then on: whoever reads that it has succeeded need not wait for the
+/// worker, or for the next refresh where another process trained.
+async fn read<S: Trainable>(
+    store: &Store,
+    registry: &Registry,
+    subject: &S,
+    run: RunId,
+) -> Result<TrainingRun<S>> {
+    let run = store.run(subject, run).await?;
+    for (camera, version) in S::models_of(&run) {
+        let Some(known) = registry.get(&camera) else { continue };
+        let shown = known.model().map(|(_, version)| version);
+        if shown.is_none_or(|shown| shown < version)
+            && let Err(error) = registry.refresh_camera(store, &camera).await
+            && error.kind() != ErrorKind::CameraNotFound
+        {
+            return Err(error);
+        }
+    }
+    Ok(run)
 }
 
 /// Refuses samples that no recipe can be fitted to, before a run is queued; the fit checks more.

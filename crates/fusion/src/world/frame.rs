@@ -106,6 +106,8 @@ pub struct FrameOutcome {
     pub too_late: bool,
     /// The changes, in order.
     pub events: Vec<TimedEvent>,
+    /// True if the cameras' clocks were estimated again.
+    pub has_new_clocks: bool,
 }
 
 /// The outcome of a fix.

@@ -9,6 +9,7 @@
 
 pub mod assignment;
 mod association_cost;
+mod camera_clocks;
 mod camera_offset;
 mod constant_velocity;
 mod frame;
@@ -19,6 +20,7 @@ mod tests;
 mod tracker;
 mod world_track;
 
+pub use camera_clocks::CameraClock;
 pub use frame::{
     CameraFrame, FixOutcome, FrameOutcome, TimedEvent, WorldDetection, WorldEvent, WorldTrackId,
 };

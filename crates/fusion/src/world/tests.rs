@@ -377,3 +377,59 @@ fn detections_without_any_error_are_tracked() {
     let state = tracker.tracks().next().expect("a track").state();
     assert!(state.covariance_m2.is_finite() && state.position.distance_m(at(0.5, 0.0)) < 0.1, "{state:?}");
 }
+
+/// Walkers who cross a place in all directions, seen by three cameras whose maps differ a little; the times of the third are
+/// late.
+#[test]
+fn a_camera_whose_clock_is_late_is_found_within_two_minutes_and_corrected() {
+    for late_s in [0.0, 0.5] {
+        let (mut tracker, mut random) = (tracker(), stream(7, 0));
+        let courses: Vec<f64> = (0..30).map(|_| std::f64::consts::TAU * random.random::<f64>()).collect();
+        let position = |walker: usize, seconds: f64| {
+            let along_m = 1.3 * (seconds - 4.0 * walker as f64 - 8.0);
+            let beside_m = 2.0 * (walker % 5) as f64 - 4.0;
+            let (sin, cos) = courses[walker].sin_cos();
+            (along_m.abs() < 10.0).then(|| at(along_m * cos - beside_m * sin, along_m * sin + beside_m * cos))
+        };
+        for step in 0..240 {
+            let seconds = 0.5 * f64::from(step);
+            for (camera, late_s, offset) in
+                [("a", 0.0, at(0.1, 0.0)), ("b", 0.0, at(0.0, -0.1)), ("c", late_s, at(-0.1, 0.1))]
+            {
+                let in_view = (0..courses.len()).filter_map(|walker| position(walker, seconds - late_s));
+                let detections = in_view.map(|own| {
+                    let noise = [0; 2].map(|_| 0.1 * standard_normal(&mut random));
+                    seen(own.plus(offset).plus(at(noise[0], noise[1])), None)
+                });
+                let detections = detections.collect();
+                let frame = frame(camera, seconds, detections);
+                let time = tracker.corrected(&frame.camera, frame.time);
+                tracker.observe(&CameraFrame { time, ..frame });
+            }
+        }
+        for (camera, late_s) in [("a", 0.0), ("b", 0.0), ("c", late_s)] {
+            let clock = tracker.clocks()[&CameraId::new(camera).expect("slug")];
+            assert!((clock.offset_s - late_s).abs() < 0.12, "{camera}: {clock:?} of {late_s}");
+            assert_eq!(clock.is_wrong(), late_s > 0.0, "{camera}: {clock:?}");
+        }
+    }
+}
+
+/// Where all targets walk alike, the difference of two maps looks like that of two clocks: nothing is corrected.
+#[test]
+fn targets_that_walk_alike_tell_nothing_of_clocks() {
+    let (mut tracker, mut random) = (tracker(), stream(8, 0));
+    for step in 0..400 {
+        let seconds = 0.5 * f64::from(step);
+        for (camera, ahead_m) in [("a", 0.0), ("b", 0.6)] {
+            let in_view = (0..50).map(|walker| 1.3 * (seconds - 4.0 * f64::from(walker)));
+            let detections = in_view.filter(|along_m| (0.0..20.0).contains(along_m)).map(|along_m| {
+                let noise = [0; 2].map(|_| 0.1 * standard_normal(&mut random));
+                seen(at(along_m + ahead_m + noise[0], noise[1]), None)
+            });
+            let detections = detections.collect();
+            tracker.observe(&frame(camera, seconds, detections));
+        }
+    }
+    assert!(tracker.clocks().values().all(|clock| !clock.is_wrong()), "{:?}", tracker.clocks());
+}

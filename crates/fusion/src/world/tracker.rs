@@ -6,12 +6,13 @@ use jiff::Timestamp;
 
 use super::assignment::{Candidate, assign};
 use super::association_cost::PredictedTrack;
+use super::camera_clocks::{CameraClock, CameraClocks, TimedPosition};
 use super::frame::{
     CameraFrame, FixOutcome, FrameOutcome, TimedEvent, WorldDetection, WorldEvent, WorldTrackId,
 };
 use super::merging::MergeCandidates;
 use super::settings::WorldTrackSettings;
-use super::world_track::{WorldTrack, seconds_from};
+use super::world_track::{Sighting, WorldTrack, seconds_from};
 use crate::domain::{CameraId, ReceiverId, ReceiverMatch};
 use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
 
@@ -23,6 +24,7 @@ pub struct WorldTracker {
     /// In the order of their ids.
     tracks: Vec<WorldTrack>,
     merge_candidates: MergeCandidates,
+    clocks: CameraClocks,
     next_id: u64,
     /// Time of the latest frame.
     time: Option<Timestamp>,
@@ -37,6 +39,7 @@ impl WorldTracker {
             settings,
             tracks: Vec::new(),
             merge_candidates: MergeCandidates::default(),
+            clocks: CameraClocks::default(),
             next_id: 1,
             time: None,
         }
@@ -58,6 +61,18 @@ impl WorldTracker {
     #[must_use]
     pub const fn time(&self) -> Option<Timestamp> {
         self.time
+    }
+
+    /// How late the times of each camera are, where crossings tell.
+    #[must_use]
+    pub const fn clocks(&self) -> &BTreeMap<CameraId, CameraClock> {
+        self.clocks.clocks()
+    }
+
+    /// The time of a camera's frame by the clock of most cameras.
+    #[must_use]
+    pub fn corrected(&self, camera: &CameraId, time: Timestamp) -> Timestamp {
+        self.clocks.corrected(camera, time)
     }
 
     /// All tracks in the order of their ids, tentative ones too.
@@ -86,8 +101,13 @@ impl WorldTracker {
 
     /// Takes the detections of one camera at one instant in. Frames of all cameras should come in the order of
     /// their times; one that is late by at most [`WorldTrackSettings::max_late_s`] is moved on with the velocity
-    /// of its targets.
+    /// of its targets. Times are those of [`Self::corrected`].
     pub fn observe(&mut self, frame: &CameraFrame) -> FrameOutcome {
+        let outcome = self.tracked(frame);
+        FrameOutcome { has_new_clocks: self.clocks.advance(frame.time), ..outcome }
+    }
+
+    fn tracked(&mut self, frame: &CameraFrame) -> FrameOutcome {
         if self.time.is_some_and(|now| seconds_from(frame.time, now) > self.settings.max_late_s) {
             let tracks = vec![None; frame.detections.len()];
             return FrameOutcome { tracks, too_late: true, ..FrameOutcome::default() };
@@ -125,7 +145,7 @@ impl WorldTracker {
         self.merge(&merged, now, &mut tracks, &mut events);
         tracks.resize(frame.detections.len(), None);
         let dropped = tracks.iter().filter(|track| track.is_none()).count();
-        FrameOutcome { tracks, dropped, too_late: false, events }
+        FrameOutcome { tracks, dropped, events, ..FrameOutcome::default() }
     }
 
     /// Takes a fix of a receiver in: it carries on the track of that receiver where no camera sees the target, or
@@ -247,6 +267,12 @@ impl WorldTracker {
         if let Some(from) = track.observe(frame, detection, offset, &self.settings) {
             let event = WorldEvent::HandedOver { track: track.id, from, to: frame.camera.clone() };
             events.push(TimedEvent { time: frame.time, event });
+        }
+        let (id, velocity) = (track.id, track.filter.velocity());
+        let own = TimedPosition { camera: &frame.camera, time: frame.time, position: detection.position };
+        for Sighting { camera, last_seen: time, position, .. } in self.tracks[index].sightings() {
+            let other = TimedPosition { camera, time: *time, position: *position };
+            self.clocks.compare(id, velocity, own, other);
         }
     }
 

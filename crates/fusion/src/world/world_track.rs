@@ -32,6 +32,8 @@ pub struct Sighting {
     pub last_seen: Timestamp,
     /// Its offset from the track then.
     pub(super) offset: CameraOffset,
+    /// The position by its own detection then, m.
+    pub(super) position: EastNorth,
 }
 
 /// The estimated state of a target at one instant.
@@ -97,7 +99,7 @@ impl WorldTrack {
         track.common_covariance_m2 = detection.common_covariance_m2;
         track.detections = 1;
         // The track is where this camera sees the target: its offset is known to be 0.
-        track.record_sighting(camera, time, detection.tracker_id.as_ref(), CameraOffset::default());
+        track.record_sighting(camera, time, detection, CameraOffset::default());
         track
     }
 
@@ -296,7 +298,7 @@ impl WorldTrack {
         self.detections += 1;
         let from = self.handed_over_from(camera, time, settings);
         self.last_seen = self.last_seen.max(time);
-        self.record_sighting(camera, time, detection.tracker_id.as_ref(), offset);
+        self.record_sighting(camera, time, detection, offset);
         from
     }
 
@@ -400,18 +402,19 @@ impl WorldTrack {
         &mut self,
         camera: &CameraId,
         time: Timestamp,
-        tracker_id: Option<&TargetId>,
+        WorldDetection { tracker_id, position, .. }: &WorldDetection,
         offset: CameraOffset,
     ) {
         match self.sightings.iter_mut().find(|it| it.camera == *camera) {
             Some(own) => {
                 own.last_seen = own.last_seen.max(time);
-                own.tracker_id = tracker_id.cloned();
+                own.tracker_id.clone_from(tracker_id);
                 own.offset = offset;
+                own.position = *position;
             }
             None => {
-                let (camera, tracker_id) = (camera.clone(), tracker_id.cloned());
-                self.sightings.push(Sighting { camera, tracker_id, last_seen: time, offset });
+                let (camera, tracker_id, position) = (camera.clone(), tracker_id.clone(), *position);
+                self.sightings.push(Sighting { camera, tracker_id, last_seen: time, offset, position });
             }
         }
     }

@@ -84,8 +84,13 @@ pub(super) fn evaluate(
             })
             .collect(),
     };
-    let mut tables =
-        vec![report.table(), report.named_table(), report.crossing_table(), report.count_table()];
+    let mut tables = vec![
+        report.table(),
+        report.named_table(),
+        report.clock_table(),
+        report.crossing_table(),
+        report.count_table(),
+    ];
     tables.retain(|table| !table.is_empty());
     print_line(&tables.join("\n").trim_end())?;
     Ok(report)
@@ -157,6 +162,12 @@ fn cases(recording: &SiteRecording) -> Vec<Case> {
         case("trained together", SiteTraining::Together, Identities::Tracked, None),
         case("the same, true identities", SiteTraining::Together, Identities::Oracle, None),
         case("the same, degraded boxes", SiteTraining::Together, Identities::Tracked, rough),
+        case(
+            "the same, one clock late",
+            SiteTraining::Together,
+            Identities::Tracked,
+            Some(Degradation::LATE),
+        ),
         case("trained apart", SiteTraining::Apart, Identities::Tracked, None),
         case("the same, true identities", SiteTraining::Apart, Identities::Oracle, None),
     ];

@@ -1,8 +1,8 @@
-//! Worse detections than those recorded: missed ones, false ones, and ids that swap.
+//! Worse detections than those recorded: missed ones, false ones, ids that swap, and a clock that is late.
 
 use std::collections::BTreeMap;
 
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -18,11 +18,16 @@ pub struct Degradation {
     pub false_per_frame: f64,
     /// Mean time between two swaps of ids in a camera, s.
     pub swap_s: f64,
+    /// Time by which the first camera's clock is late, s.
+    pub late_s: f64,
 }
 
 impl Degradation {
     /// 10 % missed, a false detection in every second frame, a swap every ten seconds.
-    pub const ROUGH: Self = Self { missed_share: 0.1, false_per_frame: 0.5, swap_s: 10.0 };
+    pub const ROUGH: Self = Self { missed_share: 0.1, false_per_frame: 0.5, swap_s: 10.0, late_s: 0.0 };
+    /// The first camera's clock is late by half a second.
+    pub const LATE: Self =
+        Self { missed_share: 0.0, false_per_frame: 0.0, swap_s: f64::INFINITY, late_s: 0.5 };
 
     /// The recording with these errors, drawn from a seed.
     #[must_use]
@@ -32,6 +37,10 @@ impl Degradation {
             let mut random = ChaCha8Rng::seed_from_u64(seed);
             random.set_stream(index as u64);
             self.degrade(camera, recording.image_size, &mut random);
+        }
+        let late = SignedDuration::try_from_secs_f64(self.late_s).unwrap_or_default();
+        for labelled in degraded.cameras.iter_mut().take(1).flat_map(|camera| &mut camera.boxes) {
+            labelled.time = labelled.time.saturating_add(late).unwrap_or(labelled.time);
         }
         degraded
     }

@@ -1,5 +1,6 @@
 //! The figures of a site as a table and as JSON.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use serde::Serialize;
@@ -39,8 +40,39 @@ pub struct SiteCase {
     pub crossings: Option<CrossingFigures>,
     /// Counts of lines over the area and of its middle, in the first draw.
     pub counts: Vec<PlaceCounts>,
+    /// The cameras whose clocks were found to be wrong, over all draws.
+    pub wrong_clocks: Vec<WrongClockFigures>,
     /// Number of draws.
     pub draws: usize,
+}
+
+/// How often and how soon a camera's clock was found to be wrong.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct WrongClockFigures {
+    /// The camera's id.
+    pub camera: String,
+    /// Draws in which it was found.
+    pub draws: usize,
+    /// Mean time to the finding in these, s.
+    pub mean_after_s: f64,
+    /// The latest, s.
+    pub latest_after_s: f64,
+}
+
+impl WrongClockFigures {
+    fn over_draws(outcomes: &[SiteOutcome]) -> Vec<Self> {
+        let mut times_s: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+        for found in outcomes.iter().flat_map(|outcome| &outcome.wrong_clocks) {
+            times_s.entry(found.camera.as_str()).or_default().push(found.after_s);
+        }
+        let figures = |(camera, times_s): (&str, Vec<f64>)| Self {
+            camera: camera.to_owned(),
+            draws: times_s.len(),
+            mean_after_s: times_s.iter().sum::<f64>() / times_s.len() as f64,
+            latest_after_s: times_s.iter().copied().fold(0.0, f64::max),
+        };
+        times_s.into_iter().map(figures).collect()
+    }
 }
 
 impl SiteCase {
@@ -78,6 +110,7 @@ impl SiteCase {
             named: outcomes.iter().filter_map(|it| it.named).reduce(NamedFigures::plus),
             crossings: CrossingFigures::over_draws(outcomes.iter().filter_map(|it| it.crossings)),
             counts: outcomes.first().map(|it| it.counts.clone()).unwrap_or_default(),
+            wrong_clocks: WrongClockFigures::over_draws(outcomes),
             draws: count,
         })
     }
@@ -178,6 +211,28 @@ impl SiteReport {
                 named.right_share(),
                 named.found_share()
             );
+        }
+        table
+    }
+
+    /// The clocks that were found to be wrong as a Markdown table; empty where none was.
+    #[must_use]
+    pub fn clock_table(&self) -> String {
+        let mut table = String::new();
+        for case in &self.cases {
+            for WrongClockFigures { camera, draws, mean_after_s, latest_after_s } in &case.wrong_clocks {
+                if table.is_empty() {
+                    table.push_str(
+                        "| case | camera whose clock was found wrong | in draws | of | after s, mean | latest |\n|---|---|---|---|---|---|\n",
+                    );
+                }
+                // Writing to a string cannot fail.
+                let _ = writeln!(
+                    table,
+                    "| {} | {camera} | {draws} | {} | {mean_after_s:.0} | {latest_after_s:.0} |",
+                    case.name, case.draws
+                );
+            }
         }
         table
     }

@@ -9,7 +9,7 @@ use super::crossing_figures::{CrossingFigures, CrossingRecorder, PlaceCounts};
 use super::receiver_feed::{NamedFigures, ReceiverFeed};
 use super::recording::{LabelledBox, RecordedFix, SiteRecording};
 use super::world_figures::{PositionFigures, ReportedTrack, WorldFigures, WorldInstant};
-use crate::domain::{BoundingBox, ImageSize, ReceiverId};
+use crate::domain::{BoundingBox, CameraId, ImageSize, ReceiverId};
 use crate::fusion::world::{CameraFrame, WorldDetection, WorldTrack, WorldTrackSettings, WorldTracker};
 use crate::geo::PlaneCovariance;
 use crate::model::{
@@ -61,6 +61,17 @@ pub struct SiteOutcome {
     pub positions: Option<PositionFigures>,
     /// The same of the targets that one camera of the recording sees, by camera.
     pub positions_in_view: Vec<Option<PositionFigures>>,
+    /// The cameras whose clocks were found to be wrong, in the order in which they were found.
+    pub wrong_clocks: Vec<WrongClock>,
+}
+
+/// A camera whose clock was found to be wrong.
+#[derive(Debug, Clone, PartialEq)]
+pub struct WrongClock {
+    /// The camera.
+    pub camera: CameraId,
+    /// Time from the first box to the finding, s.
+    pub after_s: f64,
 }
 
 /// Trains the maps with the known identities of the receivers' carriers.
@@ -178,12 +189,7 @@ pub fn track_site(
     cameras: &[usize],
     fixes: bool,
 ) -> SiteOutcome {
-    let mut frames: BTreeMap<Timestamp, BTreeMap<usize, Vec<&LabelledBox>>> = BTreeMap::new();
-    for &camera in cameras {
-        for labelled in &recording.cameras[camera].boxes {
-            frames.entry(labelled.time).or_default().entry(camera).or_default().push(labelled);
-        }
-    }
+    let mut frames = CameraFrames::new(recording, cameras);
     let in_view = visible.visible_to(cameras);
     let visits = visible.visits();
     let views: Vec<_> = (0..visible.cameras.len()).map(|camera| visible.visible_to(&[camera])).collect();
@@ -192,8 +198,10 @@ pub fn track_site(
     let mut crossings = CrossingRecorder::over(recording.plane, recording.truth.values().copied());
     let (mut records, mut instants) = (Vec::new(), Vec::new());
     let mut receivers = fixes.then(|| ReceiverFeed::new(recording));
-    for (time, by_camera) in frames {
+    let (mut start, mut wrong_clocks) = (None, Vec::new());
+    while let Some((time, by_camera)) = frames.next(&tracker) {
         let first = records.len();
+        let after_s = time.duration_since(*start.get_or_insert(time)).as_secs_f64();
         if let Some(receivers) = &mut receivers {
             receivers.advance(&mut tracker, time);
         }
@@ -214,6 +222,7 @@ pub fn track_site(
                 track,
             }));
         }
+        note_wrong_clocks(&mut wrong_clocks, &tracker, after_s);
         let position =
             |target: &usize| Some((visits.at(*target, time)?, *recording.truth.get(&(time, *target))?));
         let tracks = reported(&tracker, time, &records[first..]);
@@ -236,6 +245,53 @@ pub fn track_site(
         named: receivers.map(ReceiverFeed::figures),
         positions: PositionFigures::of(&instants),
         positions_in_view: instants_in_view.iter().map(|own| PositionFigures::of(own)).collect(),
+        wrong_clocks,
+    }
+}
+
+fn note_wrong_clocks(found: &mut Vec<WrongClock>, tracker: &WorldTracker, after_s: f64) {
+    for (camera, _) in tracker.clocks().iter().filter(|(_, clock)| clock.is_wrong()) {
+        if found.iter().all(|known| known.camera != *camera) {
+            found.push(WrongClock { camera: camera.clone(), after_s });
+        }
+    }
+}
+
+/// The boxes of an instant by camera.
+type BoxesByCamera<'a> = BTreeMap<usize, Vec<&'a LabelledBox>>;
+
+/// The frames of some cameras, in the order of their times as the tracker corrects them.
+struct CameraFrames<'a> {
+    recording: &'a SiteRecording,
+    /// By camera and stated time.
+    waiting: BTreeMap<usize, BTreeMap<Timestamp, Vec<&'a LabelledBox>>>,
+}
+
+impl<'a> CameraFrames<'a> {
+    fn new(recording: &'a SiteRecording, cameras: &[usize]) -> Self {
+        let mut waiting: BTreeMap<usize, BTreeMap<Timestamp, Vec<&LabelledBox>>> = BTreeMap::new();
+        for &camera in cameras {
+            for labelled in &recording.cameras[camera].boxes {
+                waiting.entry(camera).or_default().entry(labelled.time).or_default().push(labelled);
+            }
+        }
+        Self { recording, waiting }
+    }
+
+    /// The next instant.
+    fn next(&mut self, tracker: &WorldTracker) -> Option<(Timestamp, BoxesByCamera<'a>)> {
+        let corrected = |camera: usize, time| tracker.corrected(&self.recording.cameras[camera].id, time);
+        let next = |(camera, frames): (&usize, &BTreeMap<Timestamp, _>)| {
+            Some((*camera, corrected(*camera, *frames.first_key_value()?.0)))
+        };
+        let next: Vec<(usize, Timestamp)> = self.waiting.iter().filter_map(next).collect();
+        let time = next.iter().map(|(_, time)| *time).min()?;
+        let mut boxes = BTreeMap::new();
+        for (camera, _) in next.into_iter().filter(|(_, own)| *own == time) {
+            let first = self.waiting.get_mut(&camera).and_then(BTreeMap::pop_first);
+            boxes.extend(first.map(|(_, own)| (camera, own)));
+        }
+        Some((time, boxes))
     }
 }
 

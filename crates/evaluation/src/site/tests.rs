@@ -163,6 +163,22 @@ fn degraded_boxes_cost_some_identity_not_most_of_it() {
     assert!(rough.boxes.identity_f1 > clean.boxes.identity_f1 - 0.2, "{rough:?}");
 }
 
+#[test]
+fn a_clock_that_is_late_is_found_within_two_minutes_and_costs_little_identity() {
+    let recording = simulated(3);
+    let trained = train_site(&recording, SiteTraining::Together).expect("trained");
+    let late = Degradation::LATE.apply(&recording, 1);
+    let track = |recording: &SiteRecording| {
+        track_site(recording, recording, &trained, Identities::Tracked, &[0, 1, 2], false)
+    };
+    let (clean, late) = (track(&recording), track(&late));
+    println!("{:?} {:?}; {:?} {:?}", clean.boxes, clean.wrong_clocks, late.boxes, late.wrong_clocks);
+    assert!(clean.wrong_clocks.is_empty(), "{:?}", clean.wrong_clocks);
+    let [found] = &late.wrong_clocks[..] else { panic!("{:?}", late.wrong_clocks) };
+    assert!(found.camera == recording.cameras[0].id && found.after_s < 120.0, "{found:?}");
+    assert!(late.boxes.identity_f1 > clean.boxes.identity_f1 - 0.02, "{late:?}");
+}
+
 fn small_site() -> SiteRecording {
     let options =
         SiteOptions { walkers: 8, vehicles: 0, cameras: 2, duration_s: 60.0, ..SiteOptions::default() };

@@ -106,6 +106,7 @@ impl SiteService for Sites {
             Ok(proto::ListWorldTracksResponse {
                 tracks: tracks.points.iter().map(|point| point.as_ref().into()).collect(),
                 last_event_id: tracks.last_event.to_string(),
+                clocks: tracks.clocks.iter().map(Into::into).collect(),
             })
         })
         .await

@@ -11,7 +11,8 @@ use super::proto::watch_tracks_response::Event;
 use super::statuses::to_status;
 use crate::admission::Lease;
 use crate::app::{LossReason, LostSiteEvents, SiteEventKind, SiteEvents, StoredSiteEvent, WorldTrackPoint};
-use crate::domain::{Error, ErrorKind, SiteId};
+use crate::domain::{CameraId, Error, ErrorKind, SiteId};
+use crate::fusion::world::CameraClock;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
@@ -118,6 +119,17 @@ impl From<LostSiteEvents> for proto::WatchTracksResponse {
         };
         let event = Event::Lost(proto::LostEvents { reason: reason.into(), events: lost.events });
         Self { event_id: lost.id.to_string(), time: None, event: Some(event) }
+    }
+}
+
+impl From<(&CameraId, &CameraClock)> for proto::CameraClock {
+    fn from((camera, clock): (&CameraId, &CameraClock)) -> Self {
+        Self {
+            camera_id: camera.to_string(),
+            offset_s: clock.offset_s,
+            sigma_s: clock.sigma_s,
+            is_corrected: clock.is_wrong(),
+        }
     }
 }
 

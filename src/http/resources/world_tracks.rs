@@ -16,9 +16,10 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::tracks::{KEEP_ALIVE, PointGeometry, ReceiverMatch, event_of};
-use crate::app::{LostSiteEvents, SiteEventKind, StoredSiteEvent, WorldTrackPoint};
-use crate::domain::{Error, LiveId, Result, TargetId};
+use crate::app::{LostSiteEvents, SiteEventKind, SiteTracks, StoredSiteEvent, WorldTrackPoint};
+use crate::domain::{CameraId, Error, LiveId, Result, TargetId};
 use crate::exchange::wire::{Motion, PlaneCovariance, Position};
+use crate::fusion::world;
 use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::extract::{Client, Params, SitePath, WorldTrackPath, negotiate};
 use crate::http::plumbing::problem::{ApiResult, Problem};
@@ -124,6 +125,30 @@ impl From<&WorldTrackPoint> for WorldTrack {
     }
 }
 
+/// How late the times of a camera are beside those of most cameras of its site.
+#[derive(Serialize, ToSchema)]
+struct CameraClock {
+    /// The camera's id.
+    camera_id: String,
+    /// Seconds by which its times are later than those of the other cameras; negative if they are earlier.
+    offset_s: f64,
+    /// Standard deviation of the estimate, s.
+    sigma_s: f64,
+    /// True if the offset is beyond chance: world tracks correct the camera's times by it.
+    is_corrected: bool,
+}
+
+impl From<(&CameraId, &world::CameraClock)> for CameraClock {
+    fn from((camera, clock): (&CameraId, &world::CameraClock)) -> Self {
+        Self {
+            camera_id: camera.to_string(),
+            offset_s: clock.offset_s,
+            sigma_s: clock.sigma_s,
+            is_corrected: clock.is_wrong(),
+        }
+    }
+}
+
 /// World tracks of a site.
 #[derive(Serialize, ToSchema)]
 struct WorldTracks {
@@ -132,6 +157,10 @@ struct WorldTracks {
     /// The event after which `events` misses nothing that is not among the tracks; missing for one track.
     #[serde(skip_serializing_if = "Option::is_none")]
     last_event_id: Option<String>,
+    /// How late the times of the site's cameras are, by camera, where targets that two cameras see at once tell; missing for
+    /// one track.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    clocks: Option<Vec<CameraClock>>,
 }
 
 /// A position of a world track as a GeoJSON feature (RFC 7946).
@@ -169,11 +198,12 @@ enum Form {
 }
 
 /// The points in the form that the client accepts.
-fn answer(headers: &HeaderMap, points: &[Arc<WorldTrackPoint>], last_event: Option<LiveId>) -> ApiResult {
+fn answer(headers: &HeaderMap, points: &[Arc<WorldTrackPoint>], of_site: Option<&SiteTracks>) -> ApiResult {
     let response = match negotiate(headers, &[("application/json", Form::Json), (GEOJSON, Form::GeoJson)])? {
         Form::Json => json(&WorldTracks {
             items: points.iter().map(|point| point.as_ref().into()).collect(),
-            last_event_id: last_event.map(|id| id.to_string()),
+            last_event_id: of_site.map(|tracks| tracks.last_event.to_string()),
+            clocks: of_site.map(|tracks| tracks.clocks.iter().map(Into::into).collect()),
         })?,
         Form::GeoJson => {
             let features = points.iter().map(|point| point.as_ref().into()).collect();
@@ -199,7 +229,7 @@ async fn list_world_tracks(
     headers: HeaderMap,
 ) -> ApiResult {
     let tracks = app.world_tracks().latest(&id).await?;
-    answer(&headers, &tracks.points, Some(tracks.last_event))
+    answer(&headers, &tracks.points, Some(&tracks))
 }
 
 /// Read where a target of a site was

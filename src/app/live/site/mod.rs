@@ -14,13 +14,15 @@ pub(in crate::app) mod state;
 mod task;
 mod tracker;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::sync::lock;
 use crate::app::App;
 use crate::app::cluster::Nodes;
 use crate::app::site_registry::{ActiveSite, SiteRegistry};
-use crate::domain::{Error, ErrorKind, LiveId, Result, SiteId};
+use crate::domain::{CameraId, Error, ErrorKind, LiveId, Result, SiteId};
+use crate::fusion::world::CameraClock;
 use crate::store::Store;
 use crate::telemetry::Metrics;
 
@@ -33,6 +35,8 @@ pub use reader::{LossReason, LostSiteEvents, SiteEvents, StoredSiteEvent};
 pub struct SiteTracks {
     /// The latest point of every track, in the order of the ids.
     pub points: Vec<Arc<WorldTrackPoint>>,
+    /// How late the times of its cameras are, where crossings tell.
+    pub clocks: BTreeMap<CameraId, CameraClock>,
     /// The event after which a reader misses nothing that is not among the points.
     pub last_event: LiveId,
 }
@@ -68,7 +72,8 @@ impl WorldTracks<'_> {
         let live = &self.readable_site(id).await?.live;
         // The event first: what is published in between is in both.
         let last_event = live.id_of(live.events.latest());
-        Ok(SiteTracks { points: lock(&live.tracks).latest(), last_event })
+        let (points, clocks) = (lock(&live.tracks).latest(), lock(&live.clocks).clone());
+        Ok(SiteTracks { points, clocks, last_event })
     }
 
     /// Where a target was, oldest first, as far back as the history reaches.

@@ -1,5 +1,6 @@
 //! The state in memory of one site, from its creation (or the start of the server) to its deletion.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, OnceLock};
 
 use tokio::sync::mpsc;
@@ -11,6 +12,7 @@ use super::published::PublishedTracks;
 use crate::app::live::event_log::EventLog;
 use crate::app::live::sync::lock;
 use crate::domain::{CameraId, HistorySettings, LiveId, ReceiverId, ReceiverMatch, TargetId, TrackScope};
+use crate::fusion::world::CameraClock;
 use crate::geo::Position;
 
 /// Queue, tracks and events of one site.
@@ -24,6 +26,8 @@ pub(in crate::app) struct SiteLive {
     /// The way to the task, which starts with the first item.
     pub(super) queue: OnceLock<mpsc::Sender<SiteItem>>,
     pub(super) tracks: Mutex<PublishedTracks>,
+    /// How late the clocks of its cameras are, where crossings tell.
+    pub(super) clocks: Mutex<BTreeMap<CameraId, CameraClock>>,
     pub(super) events: Arc<EventLog<SiteEvent>>,
     pub(super) ended: CancellationToken,
 }
@@ -36,6 +40,7 @@ impl SiteLive {
             history: Mutex::default(),
             queue: OnceLock::new(),
             tracks: Mutex::default(),
+            clocks: Mutex::default(),
             events: Arc::new(EventLog::new(events)),
             ended: CancellationToken::new(),
         })

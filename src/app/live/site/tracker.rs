@@ -22,8 +22,8 @@ use crate::fusion::association::{LiveMatchSettings, WorldReceiverWindow, WorldRe
 use crate::fusion::frame_assembler::{AssembledFrame, FrameAssembler, FrameLimits, PushOutcome};
 use crate::fusion::smoother::FilterMoments;
 use crate::fusion::world::{
-    CameraFrame, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId, WorldTrackSettings,
-    WorldTracker,
+    CameraClock, CameraFrame, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId,
+    WorldTrackSettings, WorldTracker,
 };
 use crate::geo::{LocalPlane, PlaneCovariance};
 use crate::telemetry::{Metrics, SiteItemOutcome};
@@ -150,7 +150,10 @@ impl SiteTracker {
             }
             (ItemSource::Fix { .. }, None) => return,
         };
-        let time = item.time;
+        let mut time = item.time;
+        if let (Source::Camera(camera), Some(active)) = (&source, &self.active) {
+            time = active.tracker.corrected(camera, time);
+        }
         match self.frames.push(&source, is_pacing, time, item, now) {
             PushOutcome::Waiting => {}
             PushOutcome::Late => self.metrics.site_item(SiteItemOutcome::Late),
@@ -341,6 +344,9 @@ impl SiteTracker {
             }
         }
         let outcome = active.tracker.observe(&CameraFrame { camera, time, detections });
+        if outcome.has_new_clocks {
+            publish_clocks(&self.live, active.tracker.clocks());
+        }
         active.window.observe(&active.tracker, &outcome);
         self.announce(outcome.events);
         let tracked = outcome.tracks.into_iter().zip(classes);
@@ -552,6 +558,22 @@ fn detection_of(
         offset_covariance_m2: map_covariance_m2.minus(common_m2).plus(lasting_noise_m2),
         common_covariance_m2: common_m2,
     })
+}
+
+/// Publishes how late the cameras' times are. Logs which clocks are wrong, or right again, since the last time.
+fn publish_clocks(live: &SiteLive, found: &BTreeMap<CameraId, CameraClock>) {
+    let before = std::mem::replace(&mut *lock(&live.clocks), found.clone());
+    for (camera, clock) in found {
+        let was_wrong = before.get(camera).is_some_and(CameraClock::is_wrong);
+        let CameraClock { offset_s, sigma_s } = clock;
+        match (was_wrong, clock.is_wrong()) {
+            (false, true) => {
+                tracing::warn!(%camera, offset_s, sigma_s, "the camera's clock is wrong beside those of the site's other cameras");
+            }
+            (true, false) => tracing::info!(%camera, offset_s, sigma_s, "the camera's clock is right again"),
+            _ => {}
+        }
+    }
 }
 
 #[cfg(test)]

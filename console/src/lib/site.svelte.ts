@@ -4,6 +4,8 @@ import { listen } from './events';
 import type { Position, WorldTrack, WorldTrackFeature } from './types';
 
 const TRAIL_POINTS = 240;
+/** How often the cameras' clocks are asked for. */
+const CLOCKS_MS = 10_000;
 const MOST_CHANGES = 50;
 
 export interface SiteTarget extends WorldTrack {
@@ -22,13 +24,21 @@ export interface TrackChange {
   ended_track_id?: string;
 }
 
+/** A camera whose clock is wrong beside those of the site's other cameras. */
+export interface WrongClock {
+  camera_id: string;
+  offset_s: number;
+}
+
 export class SiteLive {
   targets = $state.raw<SiteTarget[]>([]);
   changes = $state.raw<TrackChange[]>([]);
+  wrongClocks = $state.raw<WrongClock[]>([]);
   isOpen = $state(false);
   wasOpen = $state(false);
   readonly #targets = new Map<string, SiteTarget>();
   readonly #stop: () => void;
+  readonly #clocks: ReturnType<typeof setInterval>;
   #frame = 0;
 
   constructor(site: string) {
@@ -57,20 +67,30 @@ export class SiteLive {
         if (isOpen) void this.#readTracks(path);
       },
     });
+    this.#clocks = setInterval(() => this.isOpen && void this.#readNow(path), CLOCKS_MS);
   }
 
   close(): void {
     this.#stop();
+    clearInterval(this.#clocks);
     cancelAnimationFrame(this.#frame);
   }
 
   /** Those that are there before the events begin; what ended while nobody listened is gone. */
   async #readTracks(path: string): Promise<void> {
-    const { items } = await get<{ items: WorldTrack[] }>(`${path}/tracks`).catch(() => ({ items: [] }));
+    const items = await this.#readNow(path);
     const ids = new Set(items.map(({ id }) => id));
     for (const id of [...this.#targets.keys()]) if (!ids.has(id)) this.#targets.delete(id);
     for (const track of items) if (!this.#targets.has(track.id)) this.#take(track);
     this.#publish();
+  }
+
+  /** The tracks; the clocks that come with them are shown. */
+  async #readNow(path: string): Promise<WorldTrack[]> {
+    type Answer = { items: WorldTrack[]; clocks?: (WrongClock & { is_corrected: boolean })[] };
+    const { items, clocks = [] } = await get<Answer>(`${path}/tracks`).catch((): Answer => ({ items: [] }));
+    this.wrongClocks = clocks.filter(({ is_corrected }) => is_corrected);
+    return items;
   }
 
   #take(track: WorldTrack): void {

@@ -593,6 +593,14 @@ const table = {
   'profile.saved': ['Saved', 'Gespeichert'],
 
   'site.changes': ['What happened', 'Was geschah'],
+  'site.clockEarly': [
+    'The times of {camera} are {seconds} s earlier than those of the other cameras. World tracks correct it. Set the camera’s clock, for example by NTP.',
+    'Die Zeiten von {camera} liegen {seconds} s vor denen der anderen Kameras. Die Spuren des Geländes berichtigen das. Die Uhr der Kamera stellen, zum Beispiel mit NTP.',
+  ],
+  'site.clockLate': [
+    'The times of {camera} are {seconds} s later than those of the other cameras. World tracks correct it. Set the camera’s clock, for example by NTP.',
+    'Die Zeiten von {camera} liegen {seconds} s nach denen der anderen Kameras. Die Spuren des Geländes berichtigen das. Die Uhr der Kamera stellen, zum Beispiel mit NTP.',
+  ],
   'site.field': ['Site: cameras of one site track their targets together', 'Gelände: Kameras eines Geländes verfolgen ihre Ziele gemeinsam'],
   'site.field.none': ['none', 'keines'],
   'site.handedOver': ['{track} went from {from} to {to}', '{track} ging von {from} zu {to}'],

@@ -13,8 +13,8 @@ use super::statuses::{Reply, answer, context, to_status};
 use crate::app::{App, HistoryRows, HistorySelection};
 use crate::archive::BoundingArea;
 use crate::domain::{
-    Acceleration, ArchivedPosition, Error, ErrorKind, HistoryKey, HistorySettings, ReceiverId, Result,
-    TargetClass, TargetId, TrackScope,
+    Acceleration, ArchivedPosition, Error, ErrorKind, HistoryKey, HistorySettings, PlaceId, ReceiverId,
+    Result, TargetClass, TargetId, TrackScope,
 };
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
@@ -118,6 +118,10 @@ fn selection(selection: Option<proto::HistorySelection>) -> Result<(TrackScope, 
         from: instant(asked.from, "from")?,
         until: instant(asked.until, "until")?,
         area: asked.area.map(area).transpose()?,
+        place: asked
+            .place_id
+            .map(|id| PlaceId::new(&id).map_err(|error| error.at("place_id")))
+            .transpose()?,
         class: asked.class.map(class).transpose()?,
         target: asked.target_id.map(target).transpose()?,
         receiver: asked.receiver_id.map(receiver).transpose()?,

@@ -99,6 +99,47 @@ async fn finished_tracks_are_kept_smoothed_and_found() {
 }
 
 #[tokio::test]
+async fn positions_in_a_place_are_found_and_deleted() {
+    let folder = data_folder();
+    let server = with_two_walkers(folder.path()).await;
+    // A triangle whose bounds hold the first 20 m of the way, its sides only those from 5 to 15 m.
+    let longitude_deg = |east_m: f64| 8.0 + 1.5e-5 * east_m / 1.14;
+    let corner = |east_m: f64, north_m: f64| json!([longitude_deg(east_m), 47.0 + north_m / 111_195.0]);
+    let ring = json!([corner(0.0, -5.0), corner(20.0, -5.0), corner(10.0, 5.0), corner(0.0, -5.0)]);
+    let triangle = json!({"id": "triangle", "camera_id": "gate", "geometry": {"type": "Polygon", "coordinates": [ring]}});
+    let way = json!([corner(5.0, -5.0), corner(5.0, 5.0)]);
+    let line =
+        json!({"id": "line", "camera_id": "gate", "geometry": {"type": "LineString", "coordinates": way}});
+    for place in [&triangle, &line] {
+        server.post("/v1/places", place).await.expect(201);
+    }
+    let inside = items(&server, "camera=gate&place=triangle&limit=1000").await;
+    assert!((16..=20).contains(&inside.len()), "{}", inside.len());
+    for row in &inside {
+        let east_m = (row["position"]["longitude_deg"].as_f64().expect("degrees") - 8.0) / 1.5e-5 * 1.14;
+        assert!((4.5..15.5).contains(&east_m), "{row}");
+    }
+    for (query, status, field) in [
+        ("camera=gate&place=line", 422, "place"),
+        ("camera=gate&place=triangle&bbox=7,46,9,48", 422, "place"),
+    ] {
+        let problem = history(&server, query).await.expect(status).json();
+        assert_eq!(problem["violations"][0]["field"], field, "{problem}");
+    }
+    history(&server, "camera=gate&place=nowhere").await.expect(404);
+    let mut client = HistoryServiceClient::new(server.channel().await);
+    let selection = proto::HistorySelection {
+        scope: of_camera("gate"),
+        place_id: Some("triangle".to_owned()),
+        ..Default::default()
+    };
+    let asked = proto::DeleteHistoryRequest { selection: Some(selection) };
+    let deleted = client.delete_history(asked).await.expect("allowed").into_inner().deleted;
+    assert_eq!(deleted as usize, inside.len());
+    assert_eq!(items(&server, "camera=gate&limit=1000").await.len(), 80 - inside.len());
+}
+
+#[tokio::test]
 async fn both_transports_give_the_same_positions_and_refuse_alike() {
     let folder = data_folder();
     let server = with_two_walkers(folder.path()).await;

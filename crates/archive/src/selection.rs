@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use jiff::Timestamp;
 
 use crate::domain::{ArchivedPosition, Error, Result, TargetClass, TargetId};
-use crate::geo::Position;
+use crate::geo::{Outline, Position};
 
 /// An area between two meridians and two parallels, degrees.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -58,6 +58,8 @@ pub struct Selection {
     pub until: Option<Timestamp>,
     /// Within this area.
     pub area: Option<BoundingArea>,
+    /// Within this area, of which `area` has the bounds.
+    pub outline: Option<Outline>,
     /// Of this class.
     pub class: Option<TargetClass>,
     /// Of one of these targets; empty for all.
@@ -74,6 +76,7 @@ impl Selection {
         self.from.is_none_or(|from| row.time >= from)
             && self.until.is_none_or(|until| row.time < until)
             && self.area.is_none_or(|it| it.contains(position.longitude_deg(), position.latitude_deg()))
+            && self.outline.as_ref().is_none_or(|it| it.contains(position))
             && self.class.as_ref().is_none_or(|class| row.class.as_ref() == Some(class))
             && (self.targets.is_empty()
                 || match &row.target {

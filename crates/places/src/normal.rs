@@ -136,7 +136,7 @@ mod tests {
         let inside = (0..draws).filter(|_| {
             let (first, second): (f64, f64) = (random.sample(StandardNormal), random.sample(StandardNormal));
             let point = at(first, 0.3 * first + (0.49f64 - 0.09).sqrt() * second).plus(mean);
-            crate::region::is_inside(&ring, point)
+            crate::geo::is_inside(&ring, point)
         });
         let share = inside.count() as f64 / f64::from(draws);
         let probability = Whitening::of(mean, covariance).expect("positive").signed_probability(&ring);

@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use geo::{Coord, LineString, Polygon, Validation};
 
 use crate::domain::{Error, Result};
-use crate::geo::{EastNorth, LocalPlane, PLANE_RANGE_M, PlaneCovariance, Position};
+use crate::geo::{EastNorth, LocalPlane, Outline, PLANE_RANGE_M, PlaneCovariance, Position, is_inside};
 use crate::geometry::Geometry;
 use crate::normal::{Whitening, cumulative};
 
@@ -127,6 +127,14 @@ impl Region {
         matches!(self.shape, Shape::Line(_))
     }
 
+    /// The area; `None` of a line.
+    pub(crate) fn outline(&self) -> Option<Outline> {
+        match &self.shape {
+            Shape::Area(rings) => Some(Outline::new(self.plane, rings.clone())),
+            Shape::Line(_) => None,
+        }
+    }
+
     pub(crate) const fn bounds_deg(&self) -> [[f64; 2]; 2] {
         self.bounds_deg
     }
@@ -244,19 +252,6 @@ fn nearest_of_line(points: &[EastNorth], point: EastNorth) -> Option<(Border, f6
     let along_m = start_m + segment.along_m;
     let margins_m = Some([along_m, before_m - along_m]);
     Some((Border { normal: segment.left, margins_m }, segment.left_m))
-}
-
-/// True if a point is in a ring, by the parity of crossings towards the east.
-pub(crate) fn is_inside(ring: &[EastNorth], point: EastNorth) -> bool {
-    let crosses = |from: &EastNorth, to: &EastNorth| {
-        if (from.north_m > point.north_m) == (to.north_m > point.north_m) {
-            return false;
-        }
-        let share = (point.north_m - from.north_m) / (to.north_m - from.north_m);
-        point.east_m < from.east_m + share * (to.east_m - from.east_m)
-    };
-    let edges = ring.iter().zip(ring.iter().cycle().skip(1));
-    edges.filter(|(from, to)| crosses(from, to)).count() % 2 == 1
 }
 
 fn signed_area(ring: &[EastNorth]) -> f64 {

@@ -7,6 +7,7 @@ use strum::IntoStaticStr;
 use utoipa::ToSchema;
 
 use crate::domain::{Error, Result, TargetClass, check_labels, check_text};
+use crate::geo::Outline;
 use crate::region::Region;
 
 pub use crate::geometry::Geometry;
@@ -152,6 +153,14 @@ impl PlaceSettings {
 
     /// The geometry in metres.
     ///
+    /// The area on the ground; `None` of a line.
+    ///
+    /// # Errors
+    /// As of settings that are stored.
+    pub fn outline(&self) -> Result<Option<Outline>> {
+        Ok(Region::of(&self.geometry, self.radius_m)?.outline())
+    }
+
     /// # Errors
     /// `InvalidArgument`, naming the field: a geometry with too few or too many corners, with a border that crosses itself,
     /// near a pole, across the antimeridian or larger than a plane holds; a rule that does not fit the geometry or lacks its

@@ -6,13 +6,16 @@ use tokio::sync::mpsc;
 
 use super::queue::{ArchivedHistory, on_archive};
 use crate::app::active_cameras::ActiveCameras;
+use crate::app::places::place_settings;
 use crate::app::registry::Registry;
 use crate::app::{App, Page, page_of};
 use crate::archive::{Archive, BoundingArea, Selection};
 use crate::clock::Clock;
 use crate::domain::{
-    ArchivedPosition, Error, ErrorKind, HistoryKey, ReceiverId, Result, TargetClass, TargetId, TrackScope,
+    ArchivedPosition, Error, ErrorKind, HistoryKey, PlaceId, ReceiverId, Result, TargetClass, TargetId,
+    TrackScope,
 };
+use crate::geo::Outline;
 use crate::store::Store;
 use jiff::{SignedDuration, Timestamp};
 
@@ -34,6 +37,8 @@ pub struct HistorySelection {
     pub until: Option<Timestamp>,
     /// Within this area.
     pub area: Option<BoundingArea>,
+    /// In this place, an area or a disc of the same camera or site.
+    pub place: Option<PlaceId>,
     /// Of this class.
     pub class: Option<TargetClass>,
     /// Of this target.
@@ -142,12 +147,15 @@ impl History<'_> {
 
     /// The selection of rows of a scope that exists and that the caller may read.
     async fn selected(&self, scope: &TrackScope, selection: HistorySelection) -> Result<Selection> {
-        let HistorySelection { from, until, area, class, target, receiver, track } = selection;
+        let HistorySelection { from, until, area, place, class, target, receiver, track } = selection;
         if from.zip(until).is_some_and(|(from, until)| from >= until) {
             return Err(Error::invalid("until", "must be after from"));
         }
         if target.is_some() && receiver.is_some() {
             return Err(Error::invalid("receiver_id", "is not possible beside target_id"));
+        }
+        if area.is_some() && place.is_some() {
+            return Err(Error::invalid("place", "is not possible beside an area"));
         }
         match scope {
             TrackScope::Camera(id) => drop(self.cameras.get(id).await?),
@@ -157,7 +165,28 @@ impl History<'_> {
             Some(receiver) => self.carriers(scope, &receiver).await?,
             None => target.into_iter().collect(),
         };
-        Ok(Selection { from, until, area, class, targets, track, ..Selection::default() })
+        let outline = match place {
+            Some(place) => Some(self.outline(scope, &place).await?),
+            None => None,
+        };
+        let bounds = outline.as_ref().map(|outline| {
+            let [[west, south], [east, north]] = outline.bounds_deg();
+            BoundingArea::new([west, south, east, north])
+        });
+        let area = bounds.transpose()?.or(area);
+        Ok(Selection { from, until, area, outline, class, targets, track, ..Selection::default() })
+    }
+
+    /// The area of a place of the scope.
+    async fn outline(&self, scope: &TrackScope, id: &PlaceId) -> Result<Outline> {
+        let place = self.store.place(id).await?;
+        if place.profile.scope != *scope {
+            return Err(Error::invalid("place", "is of another camera or site"));
+        }
+        let outline = place_settings(&place)?.outline()?;
+        outline.ok_or_else(|| {
+            Error::invalid("place", "is a line, which nothing is inside of; name an area or a disc")
+        })
     }
 
     /// The targets that carry a receiver: those that the camera, or cameras of the site, declare, and the one of the

@@ -15,7 +15,7 @@ use utoipa_axum::routes;
 use crate::app::{App, HistoryRows, HistorySelection};
 use crate::archive::{BoundingArea, FileWriter};
 use crate::domain::{
-    self, ArchivedPosition, Error, HistoryKey, ReceiverId, Result, TargetClass, TargetId, TrackScope,
+    self, ArchivedPosition, Error, HistoryKey, PlaceId, ReceiverId, Result, TargetClass, TargetId, TrackScope,
 };
 use crate::exchange::{self, Format, HistoryWriter, MotFrames, wire, write_cursor};
 use crate::geo::Position;
@@ -133,6 +133,9 @@ pub(super) struct SelectionParams {
     /// Only within `west,south,east,north`, degrees; west is greater than east across the antimeridian
     #[param(required = false)]
     bbox: String,
+    /// Only in this place, an area or a disc of that camera or site; not beside `bbox`
+    #[param(required = false)]
+    place: String,
     /// Only targets of this class
     #[param(required = false)]
     class: String,
@@ -154,6 +157,7 @@ pub(super) fn selection(params: &mut Params) -> Result<(TrackScope, HistorySelec
         from: params.time("from")?,
         until: params.time("until")?,
         area: params.take("bbox", area)?,
+        place: params.take("place", |text| PlaceId::new(text).map_err(|error| error.at("place")))?,
         class: params.take("class", |text| TargetClass::new(text).map_err(|error| error.at("class")))?,
         target: params
             .take("target_id", |text| TargetId::new(text).map_err(|error| error.at("target_id")))?,

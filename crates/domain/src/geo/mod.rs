@@ -6,10 +6,12 @@
 // Input of clients reaches this module: nothing in it may end the process.
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
+mod outline;
 mod plane;
 mod plane_covariance;
 mod position;
 
+pub use outline::{Outline, is_inside};
 pub use plane::{
     ECCENTRICITY_SQUARED, EQUATORIAL_RADIUS_M, EastNorth, LocalPlane, PLANE_RANGE_M, PlaneConstants,
 };

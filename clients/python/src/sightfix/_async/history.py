@@ -36,6 +36,7 @@ class History:
         from_: From this instant on.
         until: Before this instant.
         bbox: West, south, east and north in degrees.
+        place: A place of that camera or site, an area or a disc; not beside `bbox`.
         class_: Class of the targets.
         target_id: The target.
         receiver_id: A receiver that the target carries.
@@ -117,6 +118,7 @@ def query_of(
     from_: datetime | None = None,
     until: datetime | None = None,
     bbox: tuple[float, float, float, float] | None = None,
+    place: str | None = None,
     class_: str | None = None,
     target_id: str | None = None,
     receiver_id: str | None = None,
@@ -128,6 +130,7 @@ def query_of(
         "site": site,
         "from": from_,
         "until": until,
+        "place": place,
         "bbox": None if bbox is None else ",".join(str(degrees) for degrees in bbox),
         "class": class_,
         "target_id": target_id,

@@ -87,9 +87,9 @@ export class SiteLive {
 
   /** The tracks; the clocks that come with them are shown. */
   async #readNow(path: string): Promise<WorldTrack[]> {
-    type Answer = { items: WorldTrack[]; clocks?: (WrongClock & { is_corrected: boolean })[] };
+    type Answer = { items: WorldTrack[]; clocks?: (WrongClock & { is_wrong: boolean })[] };
     const { items, clocks = [] } = await get<Answer>(`${path}/tracks`).catch((): Answer => ({ items: [] }));
-    this.wrongClocks = clocks.filter(({ is_corrected }) => is_corrected);
+    this.wrongClocks = clocks.filter(({ is_wrong }) => is_wrong);
     return items;
   }
 

@@ -136,6 +136,8 @@ struct CameraClock {
     sigma_s: f64,
     /// True if the offset is beyond chance: world tracks correct the camera's times by it.
     is_corrected: bool,
+    /// True if it is more than the maps of the cameras can look like: the clock must be set.
+    is_wrong: bool,
 }
 
 impl From<(&CameraId, &world::CameraClock)> for CameraClock {
@@ -144,7 +146,8 @@ impl From<(&CameraId, &world::CameraClock)> for CameraClock {
             camera_id: camera.to_string(),
             offset_s: clock.offset_s,
             sigma_s: clock.sigma_s,
-            is_corrected: clock.is_wrong(),
+            is_corrected: clock.is_corrected(),
+            is_wrong: clock.is_wrong(),
         }
     }
 }

@@ -34,9 +34,10 @@ const MOST_UNDER_WAY: usize = 10_000;
 /// Mean square by which the velocities of targets differ from their mean at least, m2/s2: where all walk alike, the
 /// difference of two maps looks like that of two clocks.
 const LEAST_SPREAD_M2_S2: f64 = 0.25;
-/// A clock is wrong, and corrected, beyond this offset, s, and this many standard deviations. The difference of two maps
-/// looks like one of up to a tenth of a second.
-const LEAST_WRONG_S: f64 = 0.15;
+/// An offset is corrected beyond the first, s, and said to be wrong beyond the second, both only beyond that many standard
+/// deviations. The differences of two maps look like offsets of up to 0.2 s, whose correction does no harm.
+const LEAST_CORRECTED_S: f64 = 0.15;
+const LEAST_WRONG_S: f64 = 0.3;
 const SIGNIFICANT: f64 = 4.0;
 /// Residuals of targets count less beyond this many standard deviations (Huber).
 const HUBER: f64 = 1.5;
@@ -53,10 +54,20 @@ pub struct CameraClock {
 }
 
 impl CameraClock {
-    /// True if the offset is neither chance nor a difference of two maps. The times of the camera's frames are corrected by it.
+    /// True if the times of the camera's frames are corrected by the offset.
+    #[must_use]
+    pub fn is_corrected(&self) -> bool {
+        self.exceeds(LEAST_CORRECTED_S)
+    }
+
+    /// True if the offset is neither chance nor a difference of two maps.
     #[must_use]
     pub fn is_wrong(&self) -> bool {
-        self.offset_s.abs() > LEAST_WRONG_S.max(SIGNIFICANT * self.sigma_s)
+        self.exceeds(LEAST_WRONG_S)
+    }
+
+    fn exceeds(&self, least_s: f64) -> bool {
+        self.offset_s.abs() > least_s.max(SIGNIFICANT * self.sigma_s)
     }
 }
 
@@ -111,7 +122,7 @@ impl CameraClocks {
     }
 
     fn applied_s(&self, camera: &CameraId) -> f64 {
-        let clock = self.clocks.get(camera).filter(|clock| clock.is_wrong());
+        let clock = self.clocks.get(camera).filter(|clock| clock.is_corrected());
         clock.map_or(0.0, |clock| clock.offset_s)
     }
 

@@ -257,7 +257,7 @@ fn solved(observations: &BTreeMap<CameraPair, Vec<Observation>>) -> BTreeMap<Cam
         let weight = sigma_s.max(1e-3).powi(-2);
         for (camera, sign) in [(one, 1.0), (other, -1.0)] {
             precision[(camera, camera)] += weight;
-            // A camera that is late is behind: the slope is the negative difference.
+            // The slope is the negative difference of the offsets.
             right[camera] -= sign * weight * slope_s;
         }
         precision[(one, other)] -= weight;

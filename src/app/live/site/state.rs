@@ -56,6 +56,25 @@ impl SiteLive {
         *lock(&self.history) = history;
     }
 
+    /// Publishes how late the cameras' times are. Logs which clocks are wrong, or right again, since the last time.
+    pub(super) fn set_clocks(&self, found: BTreeMap<CameraId, CameraClock>) {
+        let mut shown = lock(&self.clocks);
+        for (camera, clock) in &found {
+            let was_wrong = shown.get(camera).is_some_and(CameraClock::is_wrong);
+            let CameraClock { offset_s, sigma_s } = clock;
+            match (was_wrong, clock.is_wrong()) {
+                (false, true) => {
+                    tracing::warn!(%camera, offset_s, sigma_s, "the camera's clock is wrong beside those of the site's other cameras");
+                }
+                (true, false) => {
+                    tracing::info!(%camera, offset_s, sigma_s, "the camera's clock is right again")
+                }
+                _ => {}
+            }
+        }
+        *shown = found;
+    }
+
     /// Ends the task and the readers of a site that is deleted, or of a server that ends.
     pub(in crate::app) fn end(&self) {
         self.ended.cancel();

@@ -22,8 +22,8 @@ use crate::fusion::association::{LiveMatchSettings, WorldReceiverWindow, WorldRe
 use crate::fusion::frame_assembler::{AssembledFrame, FrameAssembler, FrameLimits, PushOutcome};
 use crate::fusion::smoother::FilterMoments;
 use crate::fusion::world::{
-    CameraClock, CameraFrame, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId,
-    WorldTrackSettings, WorldTracker,
+    CameraFrame, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId, WorldTrackSettings,
+    WorldTracker,
 };
 use crate::geo::{LocalPlane, PlaneCovariance};
 use crate::telemetry::{Metrics, SiteItemOutcome};
@@ -150,10 +150,10 @@ impl SiteTracker {
             }
             (ItemSource::Fix { .. }, None) => return,
         };
-        let mut time = item.time;
-        if let (Source::Camera(camera), Some(active)) = (&source, &self.active) {
-            time = active.tracker.corrected(camera, time);
-        }
+        let time = match (&source, &self.active) {
+            (Source::Camera(camera), Some(active)) => active.tracker.corrected(camera, item.time),
+            _ => item.time,
+        };
         match self.frames.push(&source, is_pacing, time, item, now) {
             PushOutcome::Waiting => {}
             PushOutcome::Late => self.metrics.site_item(SiteItemOutcome::Late),
@@ -255,6 +255,8 @@ impl SiteTracker {
             self.announce_end(track, active.latest, SiteEventKind::Ended(track));
         }
         self.number_offset = self.highest_number;
+        // The next tracker knows of no clock.
+        self.live.set_clocks(BTreeMap::new());
     }
 
     fn track(&mut self, frame: AssembledFrame<Source, SiteItem>, now: Duration) {
@@ -345,7 +347,7 @@ impl SiteTracker {
         }
         let outcome = active.tracker.observe(&CameraFrame { camera, time, detections });
         if outcome.has_new_clocks {
-            publish_clocks(&self.live, active.tracker.clocks());
+            self.live.set_clocks(active.tracker.clocks().clone());
         }
         active.window.observe(&active.tracker, &outcome);
         self.announce(outcome.events);
@@ -558,22 +560,6 @@ fn detection_of(
         offset_covariance_m2: map_covariance_m2.minus(common_m2).plus(lasting_noise_m2),
         common_covariance_m2: common_m2,
     })
-}
-
-/// Publishes how late the cameras' times are. Logs which clocks are wrong, or right again, since the last time.
-fn publish_clocks(live: &SiteLive, found: &BTreeMap<CameraId, CameraClock>) {
-    let before = std::mem::replace(&mut *lock(&live.clocks), found.clone());
-    for (camera, clock) in found {
-        let was_wrong = before.get(camera).is_some_and(CameraClock::is_wrong);
-        let CameraClock { offset_s, sigma_s } = clock;
-        match (was_wrong, clock.is_wrong()) {
-            (false, true) => {
-                tracing::warn!(%camera, offset_s, sigma_s, "the camera's clock is wrong beside those of the site's other cameras");
-            }
-            (true, false) => tracing::info!(%camera, offset_s, sigma_s, "the camera's clock is right again"),
-            _ => {}
-        }
-    }
 }
 
 #[cfg(test)]

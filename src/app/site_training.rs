@@ -45,7 +45,8 @@ impl Trainable for SiteId {
     }
 
     fn models_of(run: &TrainingRun<Self>) -> Vec<(CameraId, u32)> {
-        let cameras = run.report.iter().flat_map(|report| &report.cameras);
+        let activated = run.report.iter().filter(|report| report.is_activated);
+        let cameras = activated.flat_map(|report| &report.cameras);
         cameras.filter_map(|own| Some((CameraId::new(&own.camera_id).ok()?, own.model_version))).collect()
     }
 }

@@ -119,12 +119,9 @@ async fn positions_in_a_place_are_found_and_deleted() {
         let east_m = (row["position"]["longitude_deg"].as_f64().expect("degrees") - 8.0) / 1.5e-5 * 1.14;
         assert!((4.5..15.5).contains(&east_m), "{row}");
     }
-    for (query, status, field) in [
-        ("camera=gate&place=line", 422, "place"),
-        ("camera=gate&place=triangle&bbox=7,46,9,48", 422, "place"),
-    ] {
-        let problem = history(&server, query).await.expect(status).json();
-        assert_eq!(problem["violations"][0]["field"], field, "{problem}");
+    for query in ["camera=gate&place=line", "camera=gate&place=triangle&bbox=7,46,9,48"] {
+        let problem = history(&server, query).await.expect(422).json();
+        assert_eq!(problem["violations"][0]["field"], "place", "{problem}");
     }
     history(&server, "camera=gate&place=nowhere").await.expect(404);
     let mut client = HistoryServiceClient::new(server.channel().await);

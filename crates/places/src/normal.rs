@@ -133,10 +133,11 @@ mod tests {
         let covariance = PlaneCovariance { east_m2: 1.0, north_m2: 0.49, east_north_m2: 0.3 };
         let mean = at(0.3, 0.2);
         let draws = 200_000;
+        let rings = [ring.to_vec()];
         let inside = (0..draws).filter(|_| {
             let (first, second): (f64, f64) = (random.sample(StandardNormal), random.sample(StandardNormal));
             let point = at(first, 0.3 * first + (0.49f64 - 0.09).sqrt() * second).plus(mean);
-            crate::geo::is_inside(&ring, point)
+            crate::geo::is_inside(&rings, point)
         });
         let share = inside.count() as f64 / f64::from(draws);
         let probability = Whitening::of(mean, covariance).expect("positive").signed_probability(&ring);

@@ -130,7 +130,7 @@ impl Region {
     /// The area; `None` of a line.
     pub(crate) fn outline(&self) -> Option<Outline> {
         match &self.shape {
-            Shape::Area(rings) => Some(Outline::new(self.plane, rings.clone())),
+            Shape::Area(rings) => Some(Outline::new(self.plane, rings.clone(), self.bounds_deg)),
             Shape::Line(_) => None,
         }
     }
@@ -226,8 +226,7 @@ fn nearest_of_rings(rings: &[Vec<EastNorth>], point: EastNorth) -> Option<(Borde
     let edges = rings.iter().flat_map(|ring| ring.iter().zip(ring.iter().cycle().skip(1)));
     let nearest =
         edges.map(|(from, to)| beside(*from, *to, point)).min_by(|a, b| a.away_m.total_cmp(&b.away_m))?;
-    let is_inside = rings.iter().filter(|ring| is_inside(ring, point)).count() % 2 == 1;
-    let distance_m = if is_inside { nearest.away_m } else { -nearest.away_m };
+    let distance_m = if is_inside(rings, point) { nearest.away_m } else { -nearest.away_m };
     Some((Border { normal: nearest.left, margins_m: None }, distance_m))
 }
 

@@ -151,8 +151,6 @@ impl PlaceSettings {
     /// The confidence of a place that states none.
     pub const DEFAULT_PROBABILITY: f64 = 0.95;
 
-    /// The geometry in metres.
-    ///
     /// The area on the ground; `None` of a line.
     ///
     /// # Errors
@@ -161,6 +159,8 @@ impl PlaceSettings {
         Ok(Region::of(&self.geometry, self.radius_m)?.outline())
     }
 
+    /// The geometry in metres.
+    ///
     /// # Errors
     /// `InvalidArgument`, naming the field: a geometry with too few or too many corners, with a border that crosses itself,
     /// near a pole, across the antimeridian or larger than a plane holds; a rule that does not fit the geometry or lacks its

@@ -8,36 +8,34 @@ use super::position::Position;
 pub struct Outline {
     plane: LocalPlane,
     rings: Vec<Vec<EastNorth>>,
+    bounds_deg: [[f64; 2]; 2],
 }
 
 impl Outline {
-    /// From rings in a plane, in any direction, without their first corner again at the end.
+    /// From rings in a plane, in any direction, without their first corner again at the end, and the longitude and latitude
+    /// of their south-west and north-east corner.
     #[must_use]
-    pub const fn new(plane: LocalPlane, rings: Vec<Vec<EastNorth>>) -> Self {
-        Self { plane, rings }
+    pub const fn new(plane: LocalPlane, rings: Vec<Vec<EastNorth>>, bounds_deg: [[f64; 2]; 2]) -> Self {
+        Self { plane, rings, bounds_deg }
     }
 
     /// True if a position is in the area.
     #[must_use]
     pub fn contains(&self, position: Position) -> bool {
         let point = self.plane.to_plane_within_range(position);
-        point.is_some_and(|point| self.rings.iter().filter(|ring| is_inside(ring, point)).count() % 2 == 1)
+        point.is_some_and(|point| is_inside(&self.rings, point))
     }
 
-    /// The westernmost and southernmost, and the easternmost and northernmost degrees of its corners.
+    /// South-west and north-east corner in degrees.
     #[must_use]
-    pub fn bounds_deg(&self) -> [[f64; 2]; 2] {
-        let corners = self.rings.iter().flatten().map(|corner| self.plane.to_position(*corner));
-        corners.fold([[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]], |[low, high], corner| {
-            let [east, north] = [corner.longitude_deg(), corner.latitude_deg()];
-            [[low[0].min(east), low[1].min(north)], [high[0].max(east), high[1].max(north)]]
-        })
+    pub const fn bounds_deg(&self) -> [[f64; 2]; 2] {
+        self.bounds_deg
     }
 }
 
-/// True if a point is in a ring, by the parity of crossings towards the east.
+/// True if a point is between rings, in any order: by the parity of crossings of all of them towards the east.
 #[must_use]
-pub fn is_inside(ring: &[EastNorth], point: EastNorth) -> bool {
+pub fn is_inside(rings: &[Vec<EastNorth>], point: EastNorth) -> bool {
     let crosses = |from: &EastNorth, to: &EastNorth| {
         if (from.north_m > point.north_m) == (to.north_m > point.north_m) {
             return false;
@@ -45,6 +43,6 @@ pub fn is_inside(ring: &[EastNorth], point: EastNorth) -> bool {
         let share = (point.north_m - from.north_m) / (to.north_m - from.north_m);
         point.east_m < from.east_m + share * (to.east_m - from.east_m)
     };
-    let edges = ring.iter().zip(ring.iter().cycle().skip(1));
+    let edges = rings.iter().flat_map(|ring| ring.iter().zip(ring.iter().cycle().skip(1)));
     edges.filter(|(from, to)| crosses(from, to)).count() % 2 == 1
 }

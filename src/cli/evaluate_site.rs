@@ -160,16 +160,16 @@ fn cases(recording: &SiteRecording) -> Vec<Case> {
     let rough = Some(Degradation::ROUGH);
     let mut cases = vec![
         case("trained together", SiteTraining::Together, Identities::Tracked, None),
-        case("the same, true identities", SiteTraining::Together, Identities::Oracle, None),
-        case("the same, degraded boxes", SiteTraining::Together, Identities::Tracked, rough),
+        case("together, true identities", SiteTraining::Together, Identities::Oracle, None),
+        case("together, degraded boxes", SiteTraining::Together, Identities::Tracked, rough),
         case(
-            "the same, one clock late",
+            "together, one clock late",
             SiteTraining::Together,
             Identities::Tracked,
             Some(Degradation::LATE),
         ),
         case("trained apart", SiteTraining::Apart, Identities::Tracked, None),
-        case("the same, true identities", SiteTraining::Apart, Identities::Oracle, None),
+        case("apart, true identities", SiteTraining::Apart, Identities::Oracle, None),
     ];
     cases.extend(recording.cameras.iter().enumerate().map(|(camera, recorded)| Case {
         cameras: vec![camera],
@@ -181,8 +181,8 @@ fn cases(recording: &SiteRecording) -> Vec<Case> {
 /// All cameras trained together by the phones of another draw, without fixes and with them.
 fn cases_of_other_phones(together: &Case) -> [Case; 2] {
     [
-        ("trained together by other phones", Phones::Other),
-        ("the same, with phones beside the boxes", Phones::OtherMatched),
+        ("together, other phones", Phones::Other),
+        ("together, other phones beside the boxes", Phones::OtherMatched),
     ]
     .map(|(name, phones)| Case { name: name.to_owned(), phones, ..together.clone() })
 }

@@ -128,7 +128,6 @@ impl From<(&CameraId, &CameraClock)> for proto::CameraClock {
             camera_id: camera.to_string(),
             offset_s: clock.offset_s,
             sigma_s: clock.sigma_s,
-            is_corrected: clock.is_corrected(),
             is_wrong: clock.is_wrong(),
         }
     }

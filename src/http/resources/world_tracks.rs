@@ -134,9 +134,8 @@ struct CameraClock {
     offset_s: f64,
     /// Standard deviation of the estimate, s.
     sigma_s: f64,
-    /// True if the offset is beyond chance: world tracks correct the camera's times by it.
-    is_corrected: bool,
-    /// True if it is more than the maps of the cameras can look like: the clock must be set.
+    /// True if the offset is neither chance nor a difference of two maps: world tracks correct the camera's times by it, and its
+    /// clock should be set.
     is_wrong: bool,
 }
 
@@ -146,7 +145,6 @@ impl From<(&CameraId, &world::CameraClock)> for CameraClock {
             camera_id: camera.to_string(),
             offset_s: clock.offset_s,
             sigma_s: clock.sigma_s,
-            is_corrected: clock.is_corrected(),
             is_wrong: clock.is_wrong(),
         }
     }

@@ -3,46 +3,56 @@
 //! A camera whose times are late by `o` shows a target where it was `o` ago. For two cameras and a target with the velocity v
 //!
 //! ```text
-//! z_a - z_b - v (t_a - t_b) = -(o_a - o_b) v + m + w
+//! z_a - z_b - v (t_a - t_b) = -(o_a - o_b) v + m(x) + w
 //! ```
 //!
-//! with the difference m of their maps and the noise w. What one target shows while both see it is one observation, its
-//! mean: neither map nor box changes much meanwhile. The difference of the clocks and m are the least-squares line through
-//! the targets, so that nothing is said of clocks where all targets walk alike. The offsets of all cameras are the
-//! least-squares solution of their pairs; most clocks are taken to be right, so the median is 0.
+//! with the difference m of their maps at the target's position x and the noise w. What one target shows within some seconds
+//! is one observation: v is the line through the positions by both cameras, for the velocity of the track follows each camera's
+//! map. m is a Gaussian process over x with an unknown mean, so a difference of the maps that people meet on opposite sides of a
+//! street is not taken for one of the clocks. The difference of the clocks is the generalized least-squares solution. The
+//! offsets of all cameras are the least-squares solution of their pairs; most clocks are taken to be right, so the median is 0.
 
 use std::collections::BTreeMap;
 
 use jiff::{SignedDuration, Timestamp};
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, Matrix2xX, Vector2};
 
 use super::frame::WorldTrackId;
-use crate::domain::{CameraId, Velocity};
+use crate::domain::CameraId;
 use crate::geo::EastNorth;
 
 /// Two cameras are compared by boxes at most so far apart in time, s.
 const MAX_APART_S: f64 = 1.0;
-/// Common boxes of a target that are an observation at least.
-const LEAST_BOXES: u32 = 3;
+/// Comparisons and duration, s, of an observation at least, and its duration at most.
+const LEAST_COMPARISONS: f64 = 5.0;
+const LEAST_S: f64 = 3.0;
+const MOST_S: f64 = 10.0;
 /// An observation ends when its target was not seen by both cameras for this time, s.
 const ENDED_AFTER_S: f64 = 3.0;
 /// Latest observations of two cameras that count, and the fewest.
-const MOST_TARGETS: usize = 60;
-const LEAST_TARGETS: usize = 8;
+const MOST_OBSERVATIONS: usize = 60;
+const LEAST_OBSERVATIONS: usize = 16;
 /// Pairs of cameras and targets under way at most.
 const MOST_UNDER_WAY: usize = 10_000;
 /// Mean square by which the velocities of targets differ from their mean at least, m2/s2: where all walk alike, the
 /// difference of two maps looks like that of two clocks.
 const LEAST_SPREAD_M2_S2: f64 = 0.25;
-/// An offset is corrected beyond the first, s, and said to be wrong beyond the second, both only beyond that many standard
-/// deviations. The differences of two maps look like offsets of up to 0.2 s, whose correction does no harm.
-const LEAST_CORRECTED_S: f64 = 0.15;
-const LEAST_WRONG_S: f64 = 0.3;
+/// The difference of two maps: its variance in variances of an observation's noise, and its length in root mean square
+/// distances of the targets from their mean.
+const MAP_VARIANCE: f64 = 2.0;
+const MAP_LENGTH: f64 = 1.5;
+/// The length at least, m.
+const LEAST_LENGTH_M: f64 = 1.0;
+/// An offset is wrong, and corrected, beyond this one, s, and that many standard deviations.
+const LEAST_WRONG_S: f64 = 0.2;
 const SIGNIFICANT: f64 = 4.0;
-/// Residuals of targets count less beyond this many standard deviations (Huber).
+/// Observations that miss the others by more than this many standard deviations count less (Huber), down to the least weight.
 const HUBER: f64 = 1.5;
+const LEAST_WEIGHT: f64 = 0.05;
 /// Rounds of reweighting.
-const ROUNDS: usize = 5;
+const ROUNDS: usize = 4;
+/// Time between two estimates, s.
+const REVIEW_S: f64 = 2.0;
 
 /// How late the times of a camera are.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -54,40 +64,88 @@ pub struct CameraClock {
 }
 
 impl CameraClock {
-    /// True if the times of the camera's frames are corrected by the offset.
-    #[must_use]
-    pub fn is_corrected(&self) -> bool {
-        self.exceeds(LEAST_CORRECTED_S)
-    }
-
-    /// True if the offset is neither chance nor a difference of two maps.
+    /// True if the offset is neither chance nor a difference of two maps. The times of the camera's frames are corrected by it.
     #[must_use]
     pub fn is_wrong(&self) -> bool {
-        self.exceeds(LEAST_WRONG_S)
-    }
-
-    fn exceeds(&self, least_s: f64) -> bool {
-        self.offset_s.abs() > least_s.max(SIGNIFICANT * self.sigma_s)
+        self.offset_s.abs() > LEAST_WRONG_S.max(SIGNIFICANT * self.sigma_s)
     }
 }
 
 /// Two cameras, the smaller id first.
 type CameraPair = (CameraId, CameraId);
 
-/// A target in two cameras: sums over its boxes.
+/// A target in two cameras: sums over its comparisons, with the time since the first, s, and positions, m.
 #[derive(Debug, Clone, Copy)]
 struct Common {
-    velocity_m_s: [f64; 2],
-    apart_m: [f64; 2],
-    boxes: u32,
+    first: Timestamp,
     latest: Timestamp,
+    comparisons: f64,
+    elapsed: f64,
+    elapsed_squared: f64,
+    /// Middle of the positions by both cameras, and the first camera's ahead of the second's.
+    middle: Vector2<f64>,
+    middle_elapsed: Vector2<f64>,
+    apart: Vector2<f64>,
+    /// Time of the first camera after that of the second, as stated.
+    stated: f64,
 }
 
-/// The mean of a target's velocity, m/s, and of what the first camera's positions are ahead of the second's, m.
+impl Common {
+    fn new(first: Timestamp) -> Self {
+        let zero = Vector2::zeros();
+        Self {
+            first,
+            latest: first,
+            comparisons: 0.0,
+            elapsed: 0.0,
+            elapsed_squared: 0.0,
+            middle: zero,
+            middle_elapsed: zero,
+            apart: zero,
+            stated: 0.0,
+        }
+    }
+
+    fn add(&mut self, time: Timestamp, first: Vector2<f64>, second: Vector2<f64>, stated_s: f64) {
+        let elapsed_s = time.duration_since(self.first).as_secs_f64();
+        let middle = (first + second) / 2.0;
+        self.latest = self.latest.max(time);
+        self.comparisons += 1.0;
+        self.elapsed += elapsed_s;
+        self.elapsed_squared += elapsed_s * elapsed_s;
+        self.middle += middle;
+        self.middle_elapsed += middle * elapsed_s;
+        self.apart += first - second;
+        self.stated += stated_s;
+    }
+
+    fn duration_s(&self) -> f64 {
+        self.latest.duration_since(self.first).as_secs_f64()
+    }
+
+    /// `None` if there is too little of it.
+    fn observation(&self) -> Option<Observation> {
+        if self.comparisons < LEAST_COMPARISONS || self.duration_s() < LEAST_S {
+            return None;
+        }
+        let mean_s = self.elapsed / self.comparisons;
+        let spread = self.elapsed_squared - mean_s * self.elapsed;
+        let velocity = (self.middle_elapsed - self.middle * mean_s) / spread;
+        Some(Observation {
+            velocity,
+            apart: (self.apart - velocity * self.stated) / self.comparisons,
+            position: self.middle / self.comparisons,
+        })
+    }
+}
+
+/// What a target shows of two cameras: its velocity, m/s, its position, m, and what the first camera's positions are
+/// ahead of the second's at equal times, m.
 #[derive(Debug, Clone, Copy)]
 struct Observation {
-    velocity_m_s: [f64; 2],
-    apart_m: [f64; 2],
+    velocity: Vector2<f64>,
+    apart: Vector2<f64>,
+    position: Vector2<f64>,
 }
 
 /// A box as it is compared with those of other cameras.
@@ -122,18 +180,12 @@ impl CameraClocks {
     }
 
     fn applied_s(&self, camera: &CameraId) -> f64 {
-        let clock = self.clocks.get(camera).filter(|clock| clock.is_corrected());
+        let clock = self.clocks.get(camera).filter(|clock| clock.is_wrong());
         clock.map_or(0.0, |clock| clock.offset_s)
     }
 
-    /// Compares two boxes of a track with that velocity.
-    pub(super) fn compare(
-        &mut self,
-        track: WorldTrackId,
-        velocity: Velocity,
-        own: TimedPosition<'_>,
-        other: TimedPosition<'_>,
-    ) {
+    /// Compares two boxes of a track.
+    pub(super) fn compare(&mut self, track: WorldTrackId, own: TimedPosition<'_>, other: TimedPosition<'_>) {
         let elapsed_s = own.time.duration_since(other.time).as_secs_f64();
         if elapsed_s.abs() > MAX_APART_S || own.camera == other.camera {
             return;
@@ -146,42 +198,28 @@ impl CameraClocks {
         }
         // By the times as they were stated.
         let stated_s = sign * elapsed_s + self.applied_s(first.camera) - self.applied_s(second.camera);
-        let velocity_m_s = [velocity.east_m_s, velocity.north_m_s];
-        let apart = first.position.minus(second.position);
-        let apart_m = [apart.east_m - velocity_m_s[0] * stated_s, apart.north_m - velocity_m_s[1] * stated_s];
-        let latest = own.time.max(other.time);
-        let common = self.under_way.entry(key).or_insert(Common {
-            velocity_m_s: [0.0; 2],
-            apart_m: [0.0; 2],
-            boxes: 0,
-            latest,
-        });
-        for axis in 0..2 {
-            common.velocity_m_s[axis] += velocity_m_s[axis];
-            common.apart_m[axis] += apart_m[axis];
-        }
-        common.boxes += 1;
-        common.latest = common.latest.max(latest);
+        let time = own.time.max(other.time);
+        let common = self.under_way.entry(key).or_insert_with(|| Common::new(time));
+        common.add(time, vector(first.position), vector(second.position), stated_s);
     }
 
-    /// Estimates again, at most once a second, if observations have ended; true if it did.
+    /// Estimates again, at most every two seconds, if observations have ended; true if it did.
     pub(super) fn advance(&mut self, time: Timestamp) -> bool {
         let since_s = self.swept.map_or(f64::INFINITY, |swept| time.duration_since(swept).as_secs_f64());
-        if since_s.abs() < 1.0 {
+        if since_s.abs() < REVIEW_S {
             return false;
         }
         self.swept = Some(time);
-        let is_over =
-            |common: &Common| time.duration_since(common.latest).as_secs_f64().abs() > ENDED_AFTER_S;
+        let is_over = |common: &Common| {
+            let unseen_s = time.duration_since(common.latest).as_secs_f64().abs();
+            unseen_s > ENDED_AFTER_S || common.duration_s() > MOST_S
+        };
         let mut has_ended = false;
         for ((pair, _), common) in self.under_way.extract_if(.., |_, common| is_over(common)) {
-            if common.boxes < LEAST_BOXES {
-                continue;
-            }
-            let mean = |sums: [f64; 2]| sums.map(|sum| sum / f64::from(common.boxes));
+            let Some(observation) = common.observation() else { continue };
             let own = self.observations.entry(pair).or_default();
-            own.push(Observation { velocity_m_s: mean(common.velocity_m_s), apart_m: mean(common.apart_m) });
-            if own.len() > MOST_TARGETS {
+            own.push(observation);
+            if own.len() > MOST_OBSERVATIONS {
                 own.remove(0);
             }
             has_ended = true;
@@ -194,54 +232,66 @@ impl CameraClocks {
     }
 }
 
-/// Slope and standard deviation of the least-squares line with an intercept, with the weights of Huber; `None` where the
-/// velocities hardly differ.
-fn line(observations: &[Observation]) -> Option<(f64, f64)> {
-    if observations.len() < LEAST_TARGETS {
+fn vector(position: EastNorth) -> Vector2<f64> {
+    Vector2::new(position.east_m, position.north_m)
+}
+
+/// Slope of what is apart over the velocity and its standard deviation, s; `None` where the velocities hardly differ.
+fn slope(observations: &[Observation]) -> Option<(f64, f64)> {
+    let count = observations.len();
+    if count < LEAST_OBSERVATIONS {
         return None;
     }
-    let mut weights = vec![1.0; observations.len()];
-    let mut line = None;
-    for _ in 0..ROUNDS {
-        let total: f64 = weights.iter().sum();
-        let mean = |of: fn(&Observation) -> [f64; 2]| {
-            let sum = |axis: usize| {
-                observations.iter().zip(&weights).map(|(own, weight)| weight * of(own)[axis]).sum::<f64>()
-            };
-            [sum(0) / total, sum(1) / total]
-        };
-        let (velocity, apart) = (mean(|own| own.velocity_m_s), mean(|own| own.apart_m));
-        let (mut spread, mut mixed) = (0.0, 0.0);
-        for (own, weight) in observations.iter().zip(&weights) {
-            for axis in 0..2 {
-                let of_velocity = own.velocity_m_s[axis] - velocity[axis];
-                spread += weight * of_velocity * of_velocity;
-                mixed += weight * of_velocity * (own.apart_m[axis] - apart[axis]);
-            }
-        }
-        if spread < LEAST_SPREAD_M2_S2 * total {
-            return None;
-        }
-        let slope_s = mixed / spread;
-        let residual_m = |own: &Observation| {
-            let axis =
-                |at: usize| own.apart_m[at] - apart[at] - slope_s * (own.velocity_m_s[at] - velocity[at]);
-            axis(0).hypot(axis(1))
-        };
-        let squares = observations.iter().zip(&weights).map(|(own, weight)| weight * residual_m(own).powi(2));
-        let variance_m2 = squares.sum::<f64>() / (2.0 * total - 3.0).max(1.0);
-        line = Some((slope_s, (variance_m2 / spread).sqrt()));
-        let bound_m = HUBER * (2.0 * variance_m2).sqrt();
-        weights = observations.iter().map(|own| (bound_m / residual_m(own).max(1e-9)).min(1.0)).collect();
+    let row = |of: fn(&Observation) -> Vector2<f64>| {
+        Matrix2xX::from_columns(&observations.iter().map(of).collect::<Vec<_>>())
+    };
+    let (velocity, apart, position) =
+        (row(|own| own.velocity), row(|own| own.apart), row(|own| own.position));
+    let spread = |of: &Matrix2xX<f64>| of.column_variance().sum();
+    if spread(&velocity) < LEAST_SPREAD_M2_S2 {
+        return None;
     }
-    line
+    let length_m = (MAP_LENGTH * spread(&position).sqrt()).max(LEAST_LENGTH_M);
+    let map = DMatrix::from_fn(count, count, |one, other| {
+        let apart_m = (position.column(one) - position.column(other)).norm();
+        MAP_VARIANCE * (-0.5 * (apart_m / length_m).powi(2)).exp()
+    });
+    let mut weights = DVector::from_element(count, 1.0);
+    let mut found = None;
+    for _ in 0..ROUNDS {
+        let noise = DMatrix::from_diagonal(&weights.map(f64::recip));
+        let precision = (&map + noise).cholesky()?.inverse();
+        let of_mean = precision.row_sum();
+        // Of both axes, without their means.
+        let product = |one: &Matrix2xX<f64>, other: &Matrix2xX<f64>| {
+            let means = (one * of_mean.transpose()).dot(&(other * of_mean.transpose()));
+            (one * &precision).dot(other) - means / of_mean.sum()
+        };
+        let information = product(&velocity, &velocity);
+        let slope_s = product(&velocity, &apart) / information;
+        let residual = &apart - &velocity * slope_s;
+        let variance_m2 = product(&residual, &residual) / (2 * count - 3) as f64;
+        found = Some((slope_s, (variance_m2 / information).sqrt()));
+        let mean = &residual * of_mean.transpose() / of_mean.sum();
+        let mut centred = residual;
+        for mut column in centred.column_iter_mut() {
+            column -= &mean;
+        }
+        // What each misses by if the others tell its value.
+        let missed = centred * &precision;
+        weights = DVector::from_fn(count, |at, _| {
+            let deviations = missed.column(at).norm() / (2.0 * variance_m2 * precision[(at, at)]).sqrt();
+            (HUBER / deviations.max(1e-9)).clamp(LEAST_WEIGHT, 1.0)
+        });
+    }
+    found
 }
 
 /// The clocks of all cameras that pairs tell of.
 fn solved(observations: &BTreeMap<CameraPair, Vec<Observation>>) -> BTreeMap<CameraId, CameraClock> {
-    let lines: Vec<(&CameraPair, (f64, f64))> =
-        observations.iter().filter_map(|(pair, own)| Some((pair, line(own)?))).collect();
-    let mut cameras: Vec<&CameraId> = lines.iter().flat_map(|((one, other), _)| [one, other]).collect();
+    let slopes: Vec<(&CameraPair, (f64, f64))> =
+        observations.iter().filter_map(|(pair, own)| Some((pair, slope(own)?))).collect();
+    let mut cameras: Vec<&CameraId> = slopes.iter().flat_map(|((one, other), _)| [one, other]).collect();
     cameras.sort();
     cameras.dedup();
     let count = cameras.len();
@@ -252,7 +302,7 @@ fn solved(observations: &BTreeMap<CameraPair, Vec<Observation>>) -> BTreeMap<Cam
     // A weak prior: only differences are observed.
     let mut precision = DMatrix::<f64>::identity(count, count) * 1e-2;
     let mut right = DVector::<f64>::zeros(count);
-    for ((one, other), (slope_s, sigma_s)) in &lines {
+    for ((one, other), (slope_s, sigma_s)) in &slopes {
         let (Some(one), Some(other)) = (at(one), at(other)) else { continue };
         let weight = sigma_s.max(1e-3).powi(-2);
         for (camera, sign) in [(one, 1.0), (other, -1.0)] {
@@ -265,6 +315,13 @@ fn solved(observations: &BTreeMap<CameraPair, Vec<Observation>>) -> BTreeMap<Cam
     }
     let Some(covariance) = precision.try_inverse() else { return BTreeMap::new() };
     let offsets_s = &covariance * right;
+    // Pairs that contradict each other know less than they state.
+    let missed = slopes.iter().filter_map(|((one, other), (slope_s, sigma_s))| {
+        let difference_s = offsets_s[at(one)?] - offsets_s[at(other)?];
+        Some(((slope_s + difference_s) / sigma_s.max(1e-3)).powi(2))
+    });
+    let beyond_tree = (slopes.len() + 1).saturating_sub(count).max(1) as f64;
+    let inflation = (missed.sum::<f64>() / beyond_tree).max(1.0);
     let mut order: Vec<usize> = (0..count).collect();
     order.sort_by(|one, other| offsets_s[*one].total_cmp(&offsets_s[*other]));
     let median = order[(count - 1) / 2];
@@ -272,7 +329,7 @@ fn solved(observations: &BTreeMap<CameraPair, Vec<Observation>>) -> BTreeMap<Cam
         let offset_s = offsets_s[camera] - offsets_s[median];
         let variance_s2 =
             covariance[(camera, camera)] + covariance[(median, median)] - 2.0 * covariance[(camera, median)];
-        CameraClock { offset_s, sigma_s: variance_s2.max(0.0).sqrt() }
+        CameraClock { offset_s, sigma_s: (inflation * variance_s2.max(0.0)).sqrt() }
     };
     cameras.iter().map(|camera| (*camera).clone()).zip((0..count).map(clock)).collect()
 }

@@ -268,11 +268,11 @@ impl WorldTracker {
             let event = WorldEvent::HandedOver { track: track.id, from, to: frame.camera.clone() };
             events.push(TimedEvent { time: frame.time, event });
         }
-        let (id, velocity) = (track.id, track.filter.velocity());
+        let id = track.id;
         let own = TimedPosition { camera: &frame.camera, time: frame.time, position: detection.position };
         for Sighting { camera, last_seen: time, position, .. } in self.tracks[index].sightings() {
             let other = TimedPosition { camera, time: *time, position: *position };
-            self.clocks.compare(id, velocity, own, other);
+            self.clocks.compare(id, own, other);
         }
     }
 

@@ -223,6 +223,10 @@ pub fn track_site(
             }));
         }
         note_wrong_clocks(&mut wrong_clocks, &tracker, after_s);
+        // The truth is known at the times of frames; the corrected time of a clock that is wrong lies between two of them.
+        if recording.truth.range((time, 0)..=(time, usize::MAX)).next().is_none() {
+            continue;
+        }
         let position =
             |target: &usize| Some((visits.at(*target, time)?, *recording.truth.get(&(time, *target))?));
         let tracks = reported(&tracker, time, &records[first..]);

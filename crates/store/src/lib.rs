@@ -32,6 +32,7 @@ mod query;
 mod refusals;
 mod row_decoder;
 mod rows;
+mod schema;
 mod sqlite;
 mod statements;
 #[cfg(test)]

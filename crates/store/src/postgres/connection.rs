@@ -5,10 +5,9 @@
 //! each. So nothing is expected of a connection between two transactions, and a pooler that gives out connections by
 //! transaction (PgBouncer and its like) may stand between.
 
-use std::sync::LazyLock;
 use std::time::Duration;
 
-use sqlx::migrate::{MigrateError, Migrator};
+use sqlx::migrate::MigrateError;
 use sqlx::postgres::{PgConnectOptions, PgPoolOptions};
 use sqlx::{ConnectOptions, PgPool, Postgres, Transaction};
 use tokio::time::Instant;
@@ -18,6 +17,7 @@ use super::locks::{Limit, try_lock_limit};
 use crate::domain::{Durability, Error, Result};
 use crate::folder_fault::{FolderFault, FolderFaultKind};
 use crate::location::DatabaseUrl;
+use crate::schema;
 
 /// Connections of one process.
 const CONNECTIONS: u32 = 12;
@@ -41,13 +41,6 @@ const BEGIN_SCHEMA: &str =
 
 /// The time of the database, in microseconds, as an expression.
 pub(crate) const DATABASE_NOW_US: &str = "(extract(epoch FROM clock_timestamp()) * 1000000)::BIGINT";
-
-/// The lock of the library lasts for a session, which a pooler does not keep.
-static MIGRATIONS: LazyLock<Migrator> = LazyLock::new(|| {
-    let mut migrations = sqlx::migrate!("../../migrations/postgres");
-    migrations.set_locking(false);
-    migrations
-});
 
 /// Connects, and brings the schema up to date.
 ///
@@ -118,7 +111,7 @@ async fn migrate(pool: &PgPool) -> Result<(), MigrateError> {
     loop {
         let mut transaction = begin(pool, BEGIN_SCHEMA).await?;
         if try_lock_limit(&mut transaction, Limit::Schema).await? {
-            MIGRATIONS.run_direct(None, &mut *transaction, false).await?;
+            schema::POSTGRES.run_direct(None, &mut *transaction, false).await?;
             return Ok(transaction.commit().await?);
         }
         transaction.rollback().await?;

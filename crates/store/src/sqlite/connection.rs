@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use sqlx::migrate::{MigrateError, Migrator};
+use sqlx::migrate::MigrateError;
 use sqlx::sqlite::{
     SqliteAutoVacuum, SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous,
 };
@@ -14,6 +14,7 @@ use super::errors::{is_busy, primary_code};
 use super::writer::Writer;
 use crate::domain::{Error, Result};
 use crate::folder_fault::{FolderFault, FolderFaultKind};
+use crate::schema;
 
 /// How long to wait for another process that writes.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
@@ -26,8 +27,6 @@ const OPEN_PAUSE: Duration = Duration::from_millis(50);
 /// Reads that run at once; more wait.
 const READERS: u32 = 4;
 const READER_WAIT: Duration = Duration::from_secs(10);
-
-static MIGRATIONS: Migrator = sqlx::migrate!("../../migrations/sqlite");
 
 /// Opens a database with its schema brought up to date. `max_pages` limits its size.
 pub(super) async fn open(path: &Path, max_pages: Option<u32>) -> Result<(Writer, SqlitePool)> {
@@ -87,14 +86,14 @@ async fn open_writer(options: &SqliteConnectOptions) -> Result<SqliteConnection,
 async fn connect_and_migrate(options: &SqliteConnectOptions) -> Result<SqliteConnection, MigrateError> {
     let mut connection = options.connect().await?;
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
-    MIGRATIONS.run_direct(None, &mut *transaction, false).await?;
+    schema::SQLITE.run_direct(None, &mut *transaction, false).await?;
     transaction.commit().await?;
     Ok(connection)
 }
 
 /// The step that brings a schema to what this version knows.
 pub(super) fn newest_step() -> i64 {
-    MIGRATIONS.iter().map(|step| step.version).max().unwrap_or_default()
+    schema::SQLITE.iter().map(|step| step.version).max().unwrap_or_default()
 }
 
 /// Why the file cannot be used, for the person who started the program.

@@ -28,6 +28,10 @@ pub struct NamedFigures {
     pub right: usize,
     /// Boxes of carriers.
     pub carried: usize,
+    /// Boxes on tracks that had a receiver at some time, as a reader of finished tracks sees them.
+    pub named_in_hindsight: usize,
+    /// Those of them whose target carries the receiver that its track had for most boxes.
+    pub right_in_hindsight: usize,
 }
 
 impl NamedFigures {
@@ -38,19 +42,37 @@ impl NamedFigures {
             named: self.named + other.named,
             right: self.right + other.right,
             carried: self.carried + other.carried,
+            named_in_hindsight: self.named_in_hindsight + other.named_in_hindsight,
+            right_in_hindsight: self.right_in_hindsight + other.right_in_hindsight,
         }
     }
 
-    /// Share of the boxes on tracks with a receiver whose target carries it.
+    /// Share of the boxes on tracks with a receiver whose target carries it: at that instant, and in hindsight.
     #[must_use]
-    pub fn right_share(&self) -> f64 {
-        self.right as f64 / self.named.max(1) as f64
+    pub fn right_shares(&self) -> [f64; 2] {
+        [(self.right, self.named), (self.right_in_hindsight, self.named_in_hindsight)]
+            .map(|(right, named)| right as f64 / named.max(1) as f64)
     }
 
-    /// Share of the carriers' boxes on tracks with their receiver.
+    /// Share of the carriers' boxes on tracks with their receiver: at that instant, and in hindsight.
     #[must_use]
-    pub fn found_share(&self) -> f64 {
-        self.right as f64 / self.carried.max(1) as f64
+    pub fn found_shares(&self) -> [f64; 2] {
+        [self.right, self.right_in_hindsight].map(|right| right as f64 / self.carried.max(1) as f64)
+    }
+}
+
+/// Boxes of a track: by target, and by the carrier of the receiver that it had then.
+#[derive(Default)]
+struct TrackBoxes {
+    targets: BTreeMap<Option<usize>, usize>,
+    carriers: BTreeMap<usize, usize>,
+}
+
+impl TrackBoxes {
+    /// Boxes, and those of the carrier, if the track had a receiver.
+    fn in_hindsight(&self) -> Option<(usize, usize)> {
+        let (carrier, _) = self.carriers.iter().max_by_key(|(_, boxes)| **boxes)?;
+        Some((self.targets.values().sum(), self.targets.get(&Some(*carrier)).copied().unwrap_or_default()))
     }
 }
 
@@ -63,6 +85,7 @@ pub(super) struct ReceiverFeed<'a> {
     window: WorldReceiverWindow,
     next_round: Option<Timestamp>,
     figures: NamedFigures,
+    tracks: BTreeMap<WorldTrackId, TrackBoxes>,
 }
 
 impl<'a> ReceiverFeed<'a> {
@@ -74,6 +97,7 @@ impl<'a> ReceiverFeed<'a> {
             window: WorldReceiverWindow::new(LiveMatchSettings::of_site()),
             next_round: None,
             figures: NamedFigures::default(),
+            tracks: BTreeMap::new(),
         }
     }
 
@@ -101,11 +125,19 @@ impl<'a> ReceiverFeed<'a> {
         self.window.observe(tracker, outcome);
         for (labelled, track) in boxes.iter().zip(&outcome.tracks) {
             let carrier = track.and_then(|track| self.carrier_of(tracker, track));
+            if let Some(track) = track {
+                let own = self.tracks.entry(*track).or_default();
+                *own.targets.entry(labelled.target).or_default() += 1;
+                if let Some(carrier) = carrier {
+                    *own.carriers.entry(carrier).or_default() += 1;
+                }
+            }
             let is_carrier = |target: &usize| self.carriers.values().any(|carrier| carrier == target);
             self.figures = self.figures.plus(NamedFigures {
                 named: usize::from(carrier.is_some()),
                 right: usize::from(carrier.is_some() && carrier == labelled.target),
                 carried: usize::from(labelled.target.as_ref().is_some_and(is_carrier)),
+                ..NamedFigures::default()
             });
         }
     }
@@ -116,6 +148,12 @@ impl<'a> ReceiverFeed<'a> {
     }
 
     pub(super) fn figures(self) -> NamedFigures {
-        self.figures
+        self.tracks.values().filter_map(TrackBoxes::in_hindsight).fold(self.figures, |sum, (named, right)| {
+            sum.plus(NamedFigures {
+                named_in_hindsight: named,
+                right_in_hindsight: right,
+                ..NamedFigures::default()
+            })
+        })
     }
 }

@@ -200,16 +200,16 @@ impl SiteReport {
         for (name, named) in self.cases.iter().filter_map(|case| Some((&case.name, case.named?))) {
             if table.is_empty() {
                 table.push_str(
-                    "| case | boxes on tracks with a receiver | right | share of the carriers' boxes |\n|---|---|---|---|\n",
+                    "| case | boxes on tracks with a receiver | right | share of the carriers' boxes | \
+                     in hindsight: boxes | right | share |\n|---|---|---|---|---|---|---|\n",
                 );
             }
+            let (right, found) = (named.right_shares(), named.found_shares());
             // Writing to a string cannot fail.
             let _ = writeln!(
                 table,
-                "| {name} | {} | {:.3} | {:.3} |",
-                named.named,
-                named.right_share(),
-                named.found_share()
+                "| {name} | {} | {:.3} | {:.3} | {} | {:.3} | {:.3} |",
+                named.named, right[0], found[0], named.named_in_hindsight, right[1], found[1],
             );
         }
         table

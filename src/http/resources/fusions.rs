@@ -89,12 +89,12 @@ struct Fusions<'a> {
         (FusionRequest = "application/json"),
         (String = "text/csv", example = "time,target_id,left,top,width,height\n2020-12-14T14:41:48+08:00,person-1,475,11,28,77\n"),
         (String = "application/x-ndjson", example = "{\"time\":\"2020-12-14T14:41:48+08:00\",\"target_id\":\"person-1\",\"bounding_box\":{\"left_px\":475,\"top_px\":11,\"width_px\":28,\"height_px\":77}}\n"),
-        (String = "application/geo+json"),
+        (Object = "application/geo+json"),
     )),
     responses(
         (status = 200, description = "Positions", content(
             (Fusions<'static> = "application/json"),
-            (String = "text/csv"), (String = "application/x-ndjson"), (String = "application/geo+json"),
+            (String = "text/csv"), (String = "application/x-ndjson"), (Object = "application/geo+json"),
         )),
         (status = 406, description = "None of the accepted types can be written", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "The camera has no active model", body = Problem, content_type = "application/problem+json"),

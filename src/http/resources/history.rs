@@ -203,7 +203,7 @@ struct HistoryPage<'a> {
     responses(
         (status = 200, description = "A page of positions, or all of them", content(
             (HistoryPage<'static> = "application/json"), (String = "application/x-ndjson"), (String = "text/csv"),
-            (String = "application/geo+json"), (String = "text/plain"), (Vec<u8> = "application/vnd.apache.parquet"),
+            (Object = "application/geo+json"), (String = "text/plain"), (Vec<u8> = "application/vnd.apache.parquet"),
         )),
         (status = 404, description = "No such camera or site", body = Problem, content_type = "application/problem+json"),
     )

@@ -207,7 +207,7 @@ fn import_format(headers: &HeaderMap) -> Result<Format> {
     responses(
         (status = 200, description = "A page of samples, or all of them", content(
             (SamplePage<'static> = "application/json"),
-            (String = "text/csv"), (String = "application/x-ndjson"), (String = "application/geo+json"),
+            (String = "text/csv"), (String = "application/x-ndjson"), (Object = "application/geo+json"),
         )),
         (status = 406, description = "None of the accepted types can be written", body = Problem, content_type = "application/problem+json"),
     )

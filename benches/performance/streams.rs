@@ -231,7 +231,7 @@ async fn put_places(served: &Served) {
         };
         let ring = [(-5.0, -5.0), (5.0, -5.0), (5.0, 5.0), (-5.0, 5.0), (-5.0, -5.0)].map(corner);
         let settings = PlaceSettings {
-            display_name: String::new(),
+            display_name: format!("Place {number}"),
             labels: BTreeMap::new(),
             geometry: Geometry::Polygon(vec![ring.to_vec()]),
             radius_m: None,

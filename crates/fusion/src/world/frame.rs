@@ -4,6 +4,7 @@ use std::fmt;
 
 use jiff::Timestamp;
 
+use super::camera_moves::MovedCamera;
 use crate::domain::{CameraId, ReceiverId, TargetId};
 use crate::geo::{EastNorth, PlaneCovariance};
 
@@ -108,6 +109,8 @@ pub struct FrameOutcome {
     pub events: Vec<TimedEvent>,
     /// True if the cameras' clocks were estimated again.
     pub has_new_clocks: bool,
+    /// A camera that was found to have been moved; each is reported once.
+    pub moved: Option<MovedCamera>,
 }
 
 /// The outcome of a fix.

@@ -10,9 +10,12 @@
 pub mod assignment;
 mod association_cost;
 mod camera_clocks;
+mod camera_moves;
 mod camera_offset;
+mod comparisons;
 mod constant_velocity;
 mod frame;
+mod map_difference;
 mod merging;
 mod settings;
 #[cfg(test)]
@@ -21,6 +24,7 @@ mod tracker;
 mod world_track;
 
 pub use camera_clocks::CameraClock;
+pub use camera_moves::MovedCamera;
 pub use frame::{
     CameraFrame, FixOutcome, FrameOutcome, TimedEvent, WorldDetection, WorldEvent, WorldTrackId,
 };

@@ -1,12 +1,15 @@
 //! The set of tracks of a site, camera by camera.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use jiff::Timestamp;
 
 use super::assignment::{Candidate, assign};
 use super::association_cost::PredictedTrack;
-use super::camera_clocks::{CameraClock, CameraClocks, TimedPosition};
+use super::camera_clocks::{CameraClock, CameraClocks};
+use super::camera_moves::CameraMoves;
+use super::comparisons::{Comparisons, TimedPosition};
 use super::frame::{
     CameraFrame, FixOutcome, FrameOutcome, TimedEvent, WorldDetection, WorldEvent, WorldTrackId,
 };
@@ -24,7 +27,9 @@ pub struct WorldTracker {
     /// In the order of their ids.
     tracks: Vec<WorldTrack>,
     merge_candidates: MergeCandidates,
+    comparisons: Comparisons,
     clocks: CameraClocks,
+    moves: CameraMoves,
     next_id: u64,
     /// Time of the latest frame.
     time: Option<Timestamp>,
@@ -39,7 +44,9 @@ impl WorldTracker {
             settings,
             tracks: Vec::new(),
             merge_candidates: MergeCandidates::default(),
+            comparisons: Comparisons::default(),
             clocks: CameraClocks::default(),
+            moves: CameraMoves::default(),
             next_id: 1,
             time: None,
         }
@@ -102,9 +109,32 @@ impl WorldTracker {
     /// Takes the detections of one camera at one instant in. Frames of all cameras should come in the order of
     /// their times; one that is late by at most [`WorldTrackSettings::max_late_s`] is moved on with the velocity
     /// of its targets. Times are those of [`Self::corrected`].
+    ///
+    /// What is found of the cameras on the way is corrected from then on: clocks that are wrong by [`Self::corrected`], the
+    /// positions of a camera that was moved here.
     pub fn observe(&mut self, frame: &CameraFrame) -> FrameOutcome {
-        let outcome = self.tracked(frame);
-        FrameOutcome { has_new_clocks: self.clocks.advance(frame.time), ..outcome }
+        let outcome = self.tracked(&self.moved_back(frame));
+        if !self.comparisons.advance(frame.time) {
+            return outcome;
+        }
+        self.clocks.estimate(&self.comparisons);
+        FrameOutcome { has_new_clocks: true, moved: self.moves.review(&self.comparisons), ..outcome }
+    }
+
+    /// A camera has another map from now on: what its boxes have shown beside those of other cameras is forgotten.
+    pub fn forget_comparisons(&mut self, camera: &CameraId) {
+        self.comparisons.forget(camera);
+        self.moves.forget(camera);
+    }
+
+    /// The frame without the shift of its camera.
+    fn moved_back<'a>(&self, frame: &'a CameraFrame) -> Cow<'a, CameraFrame> {
+        let Some(shift) = self.moves.shift(&frame.camera) else { return Cow::Borrowed(frame) };
+        let mut frame = frame.clone();
+        for detection in &mut frame.detections {
+            detection.position = detection.position.minus(shift);
+        }
+        Cow::Owned(frame)
     }
 
     fn tracked(&mut self, frame: &CameraFrame) -> FrameOutcome {
@@ -269,10 +299,15 @@ impl WorldTracker {
             events.push(TimedEvent { time: frame.time, event });
         }
         let id = track.id;
-        let own = TimedPosition { camera: &frame.camera, time: frame.time, position: detection.position };
-        for Sighting { camera, last_seen: time, position, .. } in self.tracks[index].sightings() {
-            let other = TimedPosition { camera, time: *time, position: *position };
-            self.clocks.compare(id, own, other);
+        let timed = |camera, time, position| TimedPosition {
+            camera,
+            time,
+            corrected_s: self.clocks.corrected_s(camera),
+            position,
+        };
+        let own = timed(&frame.camera, frame.time, detection.position);
+        for Sighting { camera, last_seen, position, .. } in self.tracks[index].sightings() {
+            self.comparisons.compare(id, own, timed(camera, *last_seen, *position));
         }
     }
 

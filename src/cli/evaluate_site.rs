@@ -56,7 +56,7 @@ pub(super) fn evaluate(
         let [together, apart] = trained;
         let (together, apart) = (together?, apart?);
         // The fixes that are matched with tracks must not be those by which the cameras were trained.
-        let of_other_phones = draws.carriers().then(|| draws.of(&recording, draw + KNOWN_MODEL_SEEDS));
+        let of_other_phones = (draws.carriers()).then(|| draws.of(&recording, draw + KNOWN_MODEL_SEEDS));
         let of_other_phones =
             of_other_phones.map(|it| train_site(&it, SiteTraining::Together)).transpose()?;
         let of_other_phones = of_other_phones.as_ref().unwrap_or(&together);
@@ -87,7 +87,7 @@ pub(super) fn evaluate(
     let mut tables = vec![
         report.table(),
         report.named_table(),
-        report.clock_table(),
+        report.found_table(),
         report.crossing_table(),
         report.count_table(),
     ];
@@ -142,7 +142,11 @@ impl Case {
         let degraded = self.degradation.map(|degradation| degradation.apply(recording, seed));
         let boxes = degraded.as_ref().unwrap_or(recording);
         let with_fixes = self.phones == Phones::OtherMatched;
-        track_site(boxes, recording, trained, self.identities, &self.cameras, with_fixes)
+        let mut outcome = track_site(boxes, recording, trained, self.identities, &self.cameras, with_fixes);
+        if let Some(knocked_at) = self.degradation.and_then(|own| own.knocked_at(recording)) {
+            outcome.count_moves_from(knocked_at);
+        }
+        outcome
     }
 }
 
@@ -167,6 +171,18 @@ fn cases(recording: &SiteRecording) -> Vec<Case> {
             SiteTraining::Together,
             Identities::Tracked,
             Some(Degradation::LATE),
+        ),
+        case(
+            "together, one camera knocked by 60 px",
+            SiteTraining::Together,
+            Identities::Tracked,
+            Some(Degradation::KNOCKED),
+        ),
+        case(
+            "together, one camera knocked by 200 px",
+            SiteTraining::Together,
+            Identities::Tracked,
+            Some(Degradation::KNOCKED_HARD),
         ),
         case("trained apart", SiteTraining::Apart, Identities::Tracked, None),
         case("apart, true identities", SiteTraining::Apart, Identities::Oracle, None),

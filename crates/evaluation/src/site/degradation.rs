@@ -1,4 +1,4 @@
-//! Worse detections than those recorded: missed ones, false ones, ids that swap, and a clock that is late.
+//! Worse detections than those recorded: missed ones, false ones, ids that swap, a clock that is late, and a camera that is knocked.
 
 use std::collections::BTreeMap;
 
@@ -20,14 +20,22 @@ pub struct Degradation {
     pub swap_s: f64,
     /// Time by which the first camera's clock is late, s.
     pub late_s: f64,
+    /// What the first camera's boxes are moved by towards the right from the middle of the recording on, in image widths.
+    pub knock: f64,
 }
 
 impl Degradation {
+    /// No fault.
+    const NONE: Self =
+        Self { missed_share: 0.0, false_per_frame: 0.0, swap_s: f64::INFINITY, late_s: 0.0, knock: 0.0 };
     /// 10 % missed, a false detection in every second frame, a swap every ten seconds.
-    pub const ROUGH: Self = Self { missed_share: 0.1, false_per_frame: 0.5, swap_s: 10.0, late_s: 0.0 };
+    pub const ROUGH: Self = Self { missed_share: 0.1, false_per_frame: 0.5, swap_s: 10.0, ..Self::NONE };
     /// The first camera's clock is late by half a second.
-    pub const LATE: Self =
-        Self { missed_share: 0.0, false_per_frame: 0.0, swap_s: f64::INFINITY, late_s: 0.5 };
+    pub const LATE: Self = Self { late_s: 0.5, ..Self::NONE };
+    /// The first camera is turned by 60 px of an image 1,920 px wide, and by 200 px.
+    pub const KNOCKED: Self = Self { knock: 60.0 / 1_920.0, ..Self::NONE };
+    /// See [`Self::KNOCKED`].
+    pub const KNOCKED_HARD: Self = Self { knock: 200.0 / 1_920.0, ..Self::NONE };
 
     /// The recording with these errors, drawn from a seed.
     #[must_use]
@@ -42,7 +50,36 @@ impl Degradation {
         for labelled in degraded.cameras.iter_mut().take(1).flat_map(|camera| &mut camera.boxes) {
             labelled.time = labelled.time.saturating_add(late).unwrap_or(labelled.time);
         }
+        self.knock(&mut degraded);
         degraded
+    }
+
+    /// When the first camera is knocked.
+    #[must_use]
+    pub fn knocked_at(&self, recording: &SiteRecording) -> Option<Timestamp> {
+        let boxes = &recording.cameras.first().filter(|_| self.knock != 0.0)?.boxes;
+        let (first, last) = (boxes.first()?.time, boxes.last()?.time);
+        first.checked_add(last.duration_since(first) / 2).ok()
+    }
+
+    fn knock(&self, recording: &mut SiteRecording) {
+        let (Some(knocked_at), Some(size)) = (self.knocked_at(recording), recording.image_size) else {
+            return;
+        };
+        let by_px = self.knock * f64::from(size.width_px());
+        let Some(camera) = recording.cameras.first_mut() else { return };
+        // A box that leaves the image is not seen.
+        let seen = |labelled: LabelledBox| {
+            if labelled.time < knocked_at {
+                return Some(labelled);
+            }
+            let own = labelled.bounding_box;
+            let left_px = own.left_px() + by_px;
+            let width_px = own.width_px().min(f64::from(size.width_px()) - left_px);
+            let moved = BoundingBox::new(left_px, own.top_px(), width_px, own.height_px()).ok()?;
+            Some(LabelledBox { bounding_box: moved, ..labelled })
+        };
+        camera.boxes = std::mem::take(&mut camera.boxes).into_iter().filter_map(seen).collect();
     }
 
     fn degrade(&self, camera: &mut RecordedCamera, image_size: Option<ImageSize>, random: &mut ChaCha8Rng) {

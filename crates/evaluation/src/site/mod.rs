@@ -26,8 +26,8 @@ pub use pair_figures::{Bin, PairFigures};
 pub use receiver_feed::NamedFigures;
 pub use receiver_matching::JointFound;
 pub use recording::{LabelledBox, RecordedCamera, RecordedFix, SiteRecording, Visits};
-pub use report::{SiteCase, SiteReport, WrongClockFigures};
+pub use report::{FoundCameraFigures, SiteCase, SiteReport};
 pub use runner::{
-    Identities, SiteOutcome, SiteTraining, TrainedSite, WrongClock, site_fit_rows, track_site, train_site,
+    FoundCamera, Identities, SiteOutcome, SiteTraining, TrainedSite, site_fit_rows, track_site, train_site,
 };
 pub use world_figures::{PositionFigures, ReportedTrack, WorldFigures, WorldInstant};

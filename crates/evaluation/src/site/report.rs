@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::crossing_figures::{CrossingFigures, PlaceCounts};
 use super::receiver_feed::NamedFigures;
-use super::runner::SiteOutcome;
+use super::runner::{FoundCamera, SiteOutcome};
 
 /// The figures of one way to track a site, or their means over draws.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -41,14 +41,16 @@ pub struct SiteCase {
     /// Counts of lines over the area and of its middle, in the first draw.
     pub counts: Vec<PlaceCounts>,
     /// The cameras whose clocks were found to be wrong, over all draws.
-    pub wrong_clocks: Vec<WrongClockFigures>,
+    pub wrong_clocks: Vec<FoundCameraFigures>,
+    /// The cameras that were found to have been moved, over all draws.
+    pub moved: Vec<FoundCameraFigures>,
     /// Number of draws.
     pub draws: usize,
 }
 
-/// How often and how soon a camera's clock was found to be wrong.
+/// How often and how soon something was found of a camera.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct WrongClockFigures {
+pub struct FoundCameraFigures {
     /// The camera's id.
     pub camera: String,
     /// Draws in which it was found.
@@ -59,10 +61,10 @@ pub struct WrongClockFigures {
     pub latest_after_s: f64,
 }
 
-impl WrongClockFigures {
-    fn over_draws(outcomes: &[SiteOutcome]) -> Vec<Self> {
+impl FoundCameraFigures {
+    fn over_draws(outcomes: &[SiteOutcome], found: fn(&SiteOutcome) -> &[FoundCamera]) -> Vec<Self> {
         let mut times_s: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
-        for found in outcomes.iter().flat_map(|outcome| &outcome.wrong_clocks) {
+        for found in outcomes.iter().flat_map(found) {
             times_s.entry(found.camera.as_str()).or_default().push(found.after_s);
         }
         let figures = |(camera, times_s): (&str, Vec<f64>)| Self {
@@ -110,7 +112,8 @@ impl SiteCase {
             named: outcomes.iter().filter_map(|it| it.named).reduce(NamedFigures::plus),
             crossings: CrossingFigures::over_draws(outcomes.iter().filter_map(|it| it.crossings)),
             counts: outcomes.first().map(|it| it.counts.clone()).unwrap_or_default(),
-            wrong_clocks: WrongClockFigures::over_draws(outcomes),
+            wrong_clocks: FoundCameraFigures::over_draws(outcomes, |it| &it.wrong_clocks),
+            moved: FoundCameraFigures::over_draws(outcomes, |it| &it.moved),
             draws: count,
         })
     }
@@ -215,21 +218,24 @@ impl SiteReport {
         table
     }
 
-    /// The clocks that were found to be wrong as a Markdown table; empty where none was.
+    /// The clocks that were found to be wrong, and the cameras that were found to have been moved, as a Markdown table; empty
+    /// where there were none.
     #[must_use]
-    pub fn clock_table(&self) -> String {
+    pub fn found_table(&self) -> String {
         let mut table = String::new();
         for case in &self.cases {
-            for WrongClockFigures { camera, draws, mean_after_s, latest_after_s } in &case.wrong_clocks {
+            let clocks = case.wrong_clocks.iter().map(|own| ("clock wrong", own));
+            let found = clocks.chain(case.moved.iter().map(|own| ("moved", own)));
+            for (what, FoundCameraFigures { camera, draws, mean_after_s, latest_after_s }) in found {
                 if table.is_empty() {
                     table.push_str(
-                        "| case | camera whose clock was found wrong | in draws | of | after s, mean | latest |\n|---|---|---|---|---|---|\n",
+                        "| case | camera | found | in draws | of | after s, mean | latest |\n|---|---|---|---|---|---|---|\n",
                     );
                 }
                 // Writing to a string cannot fail.
                 let _ = writeln!(
                     table,
-                    "| {} | {camera} | {draws} | {} | {mean_after_s:.0} | {latest_after_s:.0} |",
+                    "| {} | {camera} | {what} | {draws} | {} | {mean_after_s:.0} | {latest_after_s:.0} |",
                     case.name, case.draws
                 );
             }

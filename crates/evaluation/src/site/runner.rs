@@ -62,15 +62,27 @@ pub struct SiteOutcome {
     /// The same of the targets that one camera of the recording sees, by camera.
     pub positions_in_view: Vec<Option<PositionFigures>>,
     /// The cameras whose clocks were found to be wrong, in the order in which they were found.
-    pub wrong_clocks: Vec<WrongClock>,
+    pub wrong_clocks: Vec<FoundCamera>,
+    /// The cameras that were found to have been moved, likewise.
+    pub moved: Vec<FoundCamera>,
+    /// Time of the first box.
+    pub started_at: Timestamp,
 }
 
-/// A camera whose clock was found to be wrong.
+impl SiteOutcome {
+    /// Counts the times to findings of moved cameras from that instant on; one that is negative was found before.
+    pub fn count_moves_from(&mut self, knocked_at: Timestamp) {
+        let before_s = knocked_at.duration_since(self.started_at).as_secs_f64();
+        self.moved.iter_mut().for_each(|found| found.after_s -= before_s);
+    }
+}
+
+/// A camera of which something was found.
 #[derive(Debug, Clone, PartialEq)]
-pub struct WrongClock {
+pub struct FoundCamera {
     /// The camera.
     pub camera: CameraId,
-    /// Time from the first box to the finding, s.
+    /// Time from the first box to the finding, s ([`SiteOutcome::count_moves_from`]).
     pub after_s: f64,
 }
 
@@ -198,7 +210,9 @@ pub fn track_site(
     let mut crossings = CrossingRecorder::over(recording.plane, recording.truth.values().copied());
     let (mut records, mut instants) = (Vec::new(), Vec::new());
     let mut receivers = fixes.then(|| ReceiverFeed::new(recording));
-    let (mut start, mut wrong_clocks) = (None, Vec::new());
+    let (mut start, mut wrong_clocks, mut moved) = (None, Vec::new(), Vec::new());
+    // What the move of a camera adds to the error of its map, as in the service, m2.
+    let mut added_m2 = vec![0.0; recording.cameras.len()];
     while let Some((time, by_camera)) = frames.next(&tracker) {
         let first = records.len();
         let after_s = time.duration_since(*start.get_or_insert(time)).as_secs_f64();
@@ -208,12 +222,22 @@ pub fn track_site(
         for (camera, boxes) in by_camera {
             let detections = boxes
                 .iter()
-                .map(|labelled| detection(recording, trained, identities, camera, labelled))
+                .map(|labelled| {
+                    let located = detection(recording, trained, identities, camera, labelled);
+                    let added_m2 = PlaneCovariance::isotropic(added_m2[camera]);
+                    let offset_covariance_m2 = located.offset_covariance_m2.plus(added_m2);
+                    WorldDetection { offset_covariance_m2, ..located }
+                })
                 .collect();
             let id = recording.cameras[camera].id.clone();
             let outcome = tracker.observe(&CameraFrame { camera: id, time, detections });
             if let Some(receivers) = &mut receivers {
                 receivers.observe(&tracker, &outcome, &boxes);
+            }
+            if let Some(found) = outcome.moved {
+                let at = recording.cameras.iter().position(|own| own.id == found.camera);
+                at.into_iter().for_each(|at| added_m2[at] = found.change_variance_m2());
+                moved.push(FoundCamera { camera: found.camera, after_s });
             }
             records.extend(boxes.iter().zip(outcome.tracks).map(|(labelled, track)| BoxRecord {
                 camera,
@@ -250,13 +274,15 @@ pub fn track_site(
         positions: PositionFigures::of(&instants),
         positions_in_view: instants_in_view.iter().map(|own| PositionFigures::of(own)).collect(),
         wrong_clocks,
+        moved,
+        started_at: start.unwrap_or_default(),
     }
 }
 
-fn note_wrong_clocks(found: &mut Vec<WrongClock>, tracker: &WorldTracker, after_s: f64) {
+fn note_wrong_clocks(found: &mut Vec<FoundCamera>, tracker: &WorldTracker, after_s: f64) {
     for (camera, _) in tracker.clocks().iter().filter(|(_, clock)| clock.is_wrong()) {
         if found.iter().all(|known| known.camera != *camera) {
-            found.push(WrongClock { camera: camera.clone(), after_s });
+            found.push(FoundCamera { camera: camera.clone(), after_s });
         }
     }
 }

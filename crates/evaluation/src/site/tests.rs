@@ -179,6 +179,47 @@ fn a_clock_that_is_late_is_found_within_two_minutes_and_costs_little_identity() 
     assert!(late.boxes.identity_f1 > clean.boxes.identity_f1 - 0.02, "{late:?}");
 }
 
+/// Cameras that all see one place, and walkers.
+fn overlapping(cameras: usize) -> SiteRecording {
+    let options = SiteOptions {
+        seed: 5,
+        receiver_seed: 5,
+        cameras,
+        cameras_per_group: cameras,
+        walkers: 14,
+        vehicles: 0,
+        duration_s: 240.0,
+        ..SiteOptions::default()
+    };
+    SiteRecording::simulated(&simulate_site(&options))
+}
+
+#[test]
+fn a_knocked_camera_is_found_within_two_minutes() {
+    let recording = overlapping(3);
+    let trained = train_site(&recording, SiteTraining::Together).expect("trained");
+    let track = |boxes: &SiteRecording| {
+        track_site(boxes, &recording, &trained, Identities::Tracked, &[0, 1, 2], false)
+    };
+    let clean = track(&recording);
+    assert!(clean.moved.is_empty(), "{:?}", clean.moved);
+    let mut outcome = track(&Degradation::KNOCKED.apply(&recording, 1));
+    outcome.count_moves_from(Degradation::KNOCKED.knocked_at(&recording).expect("in the recording"));
+    println!("{:?} {:?}", outcome.moved, outcome.boxes);
+    let [found] = &outcome.moved[..] else { panic!("{:?}", outcome.moved) };
+    assert_eq!(found.camera, recording.cameras[0].id);
+    assert!((0.0..120.0).contains(&found.after_s), "{found:?}");
+}
+
+#[test]
+fn of_two_cameras_neither_is_called_moved() {
+    let recording = overlapping(2);
+    let trained = train_site(&recording, SiteTraining::Together).expect("trained");
+    let knocked = Degradation::KNOCKED.apply(&recording, 1);
+    let outcome = track_site(&knocked, &recording, &trained, Identities::Tracked, &[0, 1], false);
+    assert!(outcome.moved.is_empty(), "{:?}", outcome.moved);
+}
+
 fn small_site() -> SiteRecording {
     let options =
         SiteOptions { walkers: 8, vehicles: 0, cameras: 2, duration_s: 60.0, ..SiteOptions::default() };

@@ -344,7 +344,7 @@ impl Camera {
 }
 
 /// The camera no longer looks where it looked when its model was trained: its positions have left the
-/// receivers' fixes, beyond what the errors of both explain.
+/// receivers' fixes, or the positions by the other cameras of its site, beyond what the errors explain.
 #[derive(Serialize, ToSchema)]
 pub(super) struct CameraMoved {
     /// Number of the model version that no longer fits.
@@ -355,7 +355,7 @@ pub(super) struct CameraMoved {
     /// When the evidence was enough.
     #[schema(value_type = String, format = DateTime)]
     raised_at: Timestamp,
-    /// Mean shift of the regressed positions against the fixes since then, towards east in metres.
+    /// Mean shift of the regressed positions since then, towards east in metres.
     shift_east_m: f64,
     /// The same towards north.
     shift_north_m: f64,

@@ -1,5 +1,6 @@
 //! Sites: the resource, and one set of tracks over all cameras.
 
+mod moved_camera;
 mod resource;
 mod tracks;
 mod training;

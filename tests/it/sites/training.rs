@@ -33,7 +33,7 @@ fn site(seed: u64) -> SimulatedSite {
 }
 
 /// Samples of a camera: the boxes of those who carry a receiver with the fix of the same instant.
-fn samples_csv(site: &SimulatedSite, camera: usize) -> String {
+pub(super) fn samples_csv(site: &SimulatedSite, camera: usize) -> String {
     let carrier: HashMap<_, &TargetId> = site.carriers.iter().map(|(id, target)| (id, target)).collect();
     let of_fix = |fix: &sightfix::domain::ReceivedFix| {
         let receiver = fix.receiver_id.as_ref().expect("named");
@@ -76,7 +76,7 @@ async fn create(server: &TestServer, site: &SimulatedSite, second_samples: usize
 }
 
 /// Waits until a run is as wanted.
-async fn until(server: &TestServer, path: &str, wanted: impl Fn(&Value) -> bool) -> Value {
+pub(super) async fn until(server: &TestServer, path: &str, wanted: impl Fn(&Value) -> bool) -> Value {
     let mut seen = Value::Null;
     for _ in 0..6_000 {
         seen = server.get(path).await.expect(200).json();
@@ -88,11 +88,11 @@ async fn until(server: &TestServer, path: &str, wanted: impl Fn(&Value) -> bool)
     panic!("the run does not change: {seen}")
 }
 
-fn has_ended(run: &Value) -> bool {
+pub(super) fn has_ended(run: &Value) -> bool {
     !matches!(run["state"].as_str(), Some("queued" | "running" | "cancelling"))
 }
 
-async fn start(server: &TestServer) -> String {
+pub(super) async fn start(server: &TestServer) -> String {
     server.post(RUNS, &json!({})).await.expect(202).header("location").to_owned()
 }
 
@@ -232,7 +232,7 @@ async fn world_tracks_state_the_error_that_the_cameras_have_in_common() {
 }
 
 /// Boxes frame by frame; every camera's tracker knows the target's name.
-async fn feed(server: &TestServer, site: &SimulatedSite) {
+pub(super) async fn feed(server: &TestServer, site: &SimulatedSite) {
     let mut frames: Vec<(jiff::Timestamp, CameraId, Value)> = Vec::new();
     for camera in &site.cameras {
         for LabelledDetection { detection, target } in &camera.detections {

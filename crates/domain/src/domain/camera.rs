@@ -315,7 +315,8 @@ pub struct CameraMoved {
     pub onset_at: Timestamp,
     /// When the alarm was raised.
     pub raised_at: Timestamp,
-    /// Mean shift of the regressed positions relative to the fixes since the onset, towards east, m.
+    /// Mean shift of the regressed positions since the onset relative to the fixes, or to the positions by the other cameras of
+    /// the site, towards east, m.
     pub shift_east_m: f64,
     /// Mean shift towards north, m.
     pub shift_north_m: f64,

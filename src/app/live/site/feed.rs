@@ -44,6 +44,7 @@ impl Live<'_> {
             metrics: self.metrics.clone(),
             history: self.archived_history.queue().clone(),
             matching_slot: self.matching_slot.clone(),
+            findings: self.residuals.findings(),
         }
     }
 }
@@ -67,11 +68,12 @@ fn items_of<'a>(
     let by_box = observed.usable_box().zip(observed.plane).map(|(observed_box, plane)| {
         let regression = &observed_box.independent;
         let (covariance, scale) = (regression.covariance, regression.normal_scale());
-        let joint = camera
-            .model()
+        let model = camera.model();
+        let joint = model
             .zip(observation.bounding_box())
             .and_then(|((regressor, _), own)| Some(regressor.joint_error(&own, regression)?.scaled(scale)));
         let source = ItemSource::Box {
+            model_version: model.map_or(0, |(_, version)| version),
             covariance_m2: covariance.scaled(scale),
             map_covariance_m2: covariance.minus(regression.box_noise).scaled(scale),
             joint,

@@ -26,6 +26,8 @@ pub(super) struct SiteItem {
 pub(super) enum ItemSource {
     /// A box, through the camera's model.
     Box {
+        /// The model's version.
+        model_version: u32,
         /// Covariance of the error, m2, axes east and north of the model's plane, which those of the site's plane
         /// are to within its range.
         covariance_m2: PlaneCovariance,

@@ -12,6 +12,7 @@ use super::rounds::Rounds;
 use super::state::SiteLive;
 use super::tracker::SiteTracker;
 use crate::app::history::queue::HistoryQueue;
+use crate::app::live::alarms::FindingQueue;
 use crate::app::live::identification::MatchingSlot;
 use crate::clock::Clock;
 use crate::config::Limits;
@@ -30,12 +31,13 @@ pub(super) struct SiteResources {
     pub(super) places: SitePlaces,
     pub(super) history: HistoryQueue,
     pub(super) matching_slot: MatchingSlot,
+    pub(super) findings: FindingQueue,
 }
 
 /// Feeds the tracker until the site is deleted or the server ends.
 pub(super) async fn run(live: Arc<SiteLive>, mut queue: mpsc::Receiver<SiteItem>, resources: SiteResources) {
     let clock = resources.clock.clone();
-    let SiteResources { limits, metrics, places, history, matching_slot, .. } = resources;
+    let SiteResources { limits, metrics, places, history, matching_slot, findings, .. } = resources;
     let mut rounds = Rounds::new(matching_slot, clock.clone());
     let mut tracker = SiteTracker::new(live.clone(), limits, metrics, Some(places), history.clone());
     let mut tick = tokio::time::interval(TICK);
@@ -53,6 +55,9 @@ pub(super) async fn run(live: Arc<SiteLive>, mut queue: mpsc::Receiver<SiteItem>
             tracker.push(item, now);
         }
         tracker.advance(now);
+        for finding in tracker.take_findings() {
+            findings.send(finding).await;
+        }
         rounds.advance(&mut tracker, now).await;
         // Other tasks on this thread get their turn.
         tokio::task::yield_now().await;

@@ -15,15 +15,16 @@ use super::state::SiteLive;
 use crate::app::history::path::{FinishedTrack, RecordedState};
 use crate::app::history::queue::HistoryQueue;
 use crate::app::history::recorder::TrackRecorder;
+use crate::app::live::alarms::Finding;
 use crate::app::live::sync::lock;
 use crate::config::Limits;
-use crate::domain::{CameraId, LiveId, ReceiverId, RunId, TargetClass, TargetId};
+use crate::domain::{CameraId, CameraMoved, LiveId, ReceiverId, RunId, TargetClass, TargetId};
 use crate::fusion::association::{LiveMatchSettings, WorldReceiverWindow, WorldReceivers};
 use crate::fusion::frame_assembler::{AssembledFrame, FrameAssembler, FrameLimits, PushOutcome};
 use crate::fusion::smoother::FilterMoments;
 use crate::fusion::world::{
-    CameraFrame, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId, WorldTrackSettings,
-    WorldTracker,
+    CameraFrame, MovedCamera, TimedEvent, WorldDetection, WorldEvent, WorldTrack, WorldTrackId,
+    WorldTrackSettings, WorldTracker,
 };
 use crate::geo::{LocalPlane, PlaneCovariance};
 use crate::telemetry::{Metrics, SiteItemOutcome};
@@ -67,6 +68,8 @@ pub(super) struct SiteTracker {
     /// Those of them that are recorded, if the site has a history.
     recorders: HashMap<LiveId, TrackRecorder>,
     history: HistoryQueue,
+    /// Cameras that were moved, as far as nobody has taken them.
+    findings: Vec<Finding>,
 }
 
 /// The model by which a camera's boxes were located.
@@ -96,6 +99,8 @@ struct ActiveTracker {
     tracked_at: Duration,
     /// The latest time of a frame.
     latest: Timestamp,
+    /// The version of each camera's model whose boxes came last.
+    model_versions: BTreeMap<CameraId, u32>,
     /// Positions of its tracks and fixes of its receivers, and who carries what.
     window: WorldReceiverWindow,
 }
@@ -131,7 +136,13 @@ impl SiteTracker {
             announced: HashMap::new(),
             recorders: HashMap::new(),
             history,
+            findings: Vec::new(),
         }
+    }
+
+    /// The cameras that were found to have been moved since the last call.
+    pub(super) fn take_findings(&mut self) -> Vec<Finding> {
+        std::mem::take(&mut self.findings)
     }
 
     /// Takes an item; [`Self::advance`] tracks what is complete.
@@ -310,6 +321,7 @@ impl SiteTracker {
             has_trusted_plane: stated.or(model_origin).is_some(),
             tracked_at: Duration::ZERO,
             latest: first.time,
+            model_versions: BTreeMap::new(),
             window: WorldReceiverWindow::new(LiveMatchSettings::of_site()),
         };
         let is_held = holds(&active);
@@ -345,7 +357,9 @@ impl SiteTracker {
                 classes.push(item.class.clone());
             }
         }
+        active.follow_model(&camera, items);
         let outcome = active.tracker.observe(&CameraFrame { camera, time, detections });
+        self.findings.extend(outcome.moved.as_ref().and_then(|moved| active.finding(moved)));
         if outcome.has_new_clocks {
             self.live.set_clocks(active.tracker.clocks().clone());
         }
@@ -521,6 +535,34 @@ impl SiteTracker {
     }
 }
 
+impl ActiveTracker {
+    /// What a camera's boxes have shown beside those of others holds for one version of its model.
+    fn follow_model(&mut self, camera: &CameraId, items: &[SiteItem]) {
+        let version_of = |item: &SiteItem| match item.source {
+            ItemSource::Box { model_version, .. } => Some(model_version),
+            ItemSource::Fix { .. } => None,
+        };
+        let Some(version) = items.iter().find_map(version_of) else { return };
+        let before = self.model_versions.insert(camera.clone(), version);
+        if before.is_some_and(|before| before != version) {
+            self.tracker.forget_comparisons(camera);
+        }
+    }
+
+    fn finding(&self, found: &MovedCamera) -> Option<Finding> {
+        let moved = CameraMoved {
+            model_version: *self.model_versions.get(&found.camera)?,
+            onset_at: found.onset_at,
+            raised_at: self.latest,
+            shift_east_m: found.shift.east_m,
+            shift_north_m: found.shift.north_m,
+            statistic: found.statistic,
+            targets: u32::try_from(found.targets).unwrap_or(u32::MAX),
+        };
+        Some(Finding { camera: found.camera.clone(), moved })
+    }
+}
+
 impl Carrier {
     fn is_outdated(&self, now: Duration) -> bool {
         now.saturating_sub(self.noted_at) >= CARRIER_FOR
@@ -602,6 +644,7 @@ mod tests {
                 class: None,
                 position: origin,
                 source: ItemSource::Box {
+                    model_version: 1,
                     covariance_m2: PlaneCovariance::isotropic(self.box_variance_m2),
                     map_covariance_m2: PlaneCovariance::isotropic(0.16),
                     joint: None,

@@ -4,6 +4,11 @@ use super::measurement::MeasurementSource;
 use crate::domain::{NoiseCorrelation, SessionBias};
 use crate::model::Regressor;
 
+/// Correlation length of the error of a camera's model, in radii of its scene (three standard deviations of the training
+/// positions): most of the error is one shift or scale of the whole scene. Chosen from 0.3 to 100 on the simulated worlds
+/// from seed 901 on (docs/explanation/method.md, "Tracking").
+const LENGTH_PER_SCENE_RADIUS: f64 = 4.0;
+
 /// Correlation in time and space of a regressed position's error, whose variance is known.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RegressionNoise {
@@ -130,7 +135,7 @@ impl TrackSettings {
             gnss_session: noise.gnss_session,
             regression: RegressionNoise {
                 correlation: noise.regression,
-                correlation_length_m: noise.regression_length_m,
+                correlation_length_m: LENGTH_PER_SCENE_RADIUS * noise.regression_length_m,
                 ..RegressionNoise::default()
             },
             frozen_after_s: regressor.frozen_after_s(),

@@ -139,6 +139,33 @@ fn boxes_of_another_error_say_nothing_of_the_error_in_between() {
 }
 
 #[test]
+fn boxes_that_state_small_errors_by_chance_do_not_lead_the_track() {
+    // Every third box states a third of the variance that the others state, and is as far from the truth.
+    let boxes = |second: u32| {
+        let (is_sure, east_m) = (second.is_multiple_of(3), 1.4 * f64::from(second));
+        let (north_m, variance_m2) = if is_sure { (3.0, 1.0) } else { (-3.0, 3.0) };
+        let measured = MeasuredPosition {
+            white: Some(PlaneCovariance::isotropic(0.1)),
+            ..MeasuredPosition::isotropic(EastNorth { east_m, north_m }, variance_m2)
+        };
+        Measurement { time: at_s(second.into()), fix: None, regressed: Some(measured) }
+    };
+    let mut track = Track::start(TrackSettings::default(), &boxes(0)).expect("a box");
+    let (mut north_m, mut least_r95_m) = (0.0, f64::INFINITY);
+    for second in 1..=150 {
+        let state = track.update(&boxes(second));
+        if second > 60 {
+            north_m += state.position.north_m / 90.0;
+            least_r95_m = state.r95_m.min(least_r95_m);
+        }
+    }
+    println!("{north_m} m, {least_r95_m} m");
+    // The mean of the boxes' variances has a 95 % radius of 3.7 m, the variance of the surer ones one of 2.4 m.
+    assert!(north_m < 1.5, "{north_m} m");
+    assert!(least_r95_m > 3.3, "{least_r95_m} m");
+}
+
+#[test]
 fn many_boxes_are_not_stated_to_be_better_than_one() {
     let settings = TrackSettings {
         regression: RegressionNoise { correlation_length_m: 1.0, ..RegressionNoise::default() },
@@ -495,8 +522,11 @@ fn settings_are_those_of_the_model_and_the_defaults_for_an_earlier_format() {
     };
     let mut artifact =
         fit(&train, &options, &mut |_| std::ops::ControlFlow::Continue(())).expect("usable samples");
-    let fitted = TrackSettings::from_model(&artifact.load().expect("a model"));
+    let model = artifact.load().expect("a model");
+    let fitted = TrackSettings::from_model(&model);
     assert_ne!(fitted, TrackSettings::default());
+    let length_m = fitted.regression.correlation_length_m;
+    assert!(length_m > 2.0 * model.scene_radius_m(), "{length_m} m");
     artifact.metadata.parameters.retain(|name, _| !name.starts_with("track_"));
     let earlier = TrackSettings::from_model(&artifact.load().expect("a model"));
     assert_eq!(earlier, TrackSettings::default());

@@ -13,7 +13,7 @@ pub struct TrackNoiseModel {
     pub gnss_session: SessionBias,
     /// The noise of the model's error while the target is stationary.
     pub regression: NoiseCorrelation,
-    /// Distance over which the correlation of the model's error falls to 1/e, m.
+    /// Radius of the scene, m: the unit of the distance over which the model's error decorrelates.
     pub regression_length_m: f64,
 }
 

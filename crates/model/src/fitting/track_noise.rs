@@ -13,8 +13,8 @@ use crate::samples::sequences::{fix_sequences, sequences};
 /// Time constant of the model's own error at one place, s: the error of a map does not change while
 /// a target is stationary.
 const MODEL_TIME_CONSTANT_S: f64 = 86_400.0;
-/// Correlation length of the model's own error, in standard deviations of the training positions:
-/// most of the error of a map is a shift or scale common to the whole scene.
+/// Radius of the scene, in standard deviations of the training positions. Tracks take some radii for the correlation
+/// length of the model's own error: most of it is a shift or scale common to the whole scene.
 const MODEL_LENGTH_SIGMAS: f64 = 3.0;
 /// Share of the receiver's variance that is taken to last for a session where the fit does not estimate it:
 /// half the standard deviation of the rest, as the prior of the recipe `gaussian_process`.

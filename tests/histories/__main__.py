@@ -36,6 +36,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--nodes", type=int, default=3, help="server processes on postgres, 1 to 5; a folder has one")
     parser.add_argument("--replication", choices=REPLICATIONS, default="none", help="of postgres, with fail-overs")
     parser.add_argument("--kinds", nargs="*", default=[], help="only these kinds of faults")
+    parser.add_argument("--next", type=Path, metavar="BINARY", help="upgrade: rolling restarts start this one")
     parser.add_argument("--out", type=Path, help="folder of the history; must not exist")
     parser.add_argument("--check", type=Path, metavar="FOLDER", help="only check the history of a folder again")
     parser.add_argument("--planted", action="store_true", help="no faults: break promises on purpose, and find that")
@@ -99,8 +100,9 @@ def main() -> int:
             return 0 if check_again(given.check) else 1
         most = DataFolder.most_nodes if given.backend == "folder" else PostgreSQL.most_nodes
         options = Options(
-            given.seed, given.faults, given.backend, min(given.nodes, most), given.replication, given.kinds, SETTLE_S
-        )
+            given.seed, given.faults, given.backend, min(given.nodes, most), given.replication, given.kinds, SETTLE_S,
+            str(given.next.resolve()) if given.next else None,
+        )  # fmt: skip
         new = ROOT / "target" / "histories" / f"{given.backend}-{given.seed}-{int(time.time())}"
         folder = (given.out or new).resolve()
         if given.soak is not None:

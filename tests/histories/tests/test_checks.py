@@ -1,6 +1,14 @@
 """What the checks take into account beside the operations themselves."""
 
-from histories.checks import History, lost_queues, without_lost_changes
+from typing import Any
+
+from histories.checks import (
+    History,
+    lost_queues,
+    streamed_samples_are_stored_exactly_once,
+    without_lost_changes,
+)
+from histories.client import at
 from histories.nemesis import Interval, draw
 from histories.record import Operation
 from histories.soak import has_grown
@@ -47,6 +55,30 @@ def test_an_orderly_end_excuses_nothing_but_outages() -> None:
     assert windows_s(fault("node-restart", 10, 12)) == []
     assert windows_s(fault("database-kill", 9, 11), fault("node-restart", 10, 12)) == [(8.4, 12)]
     assert windows_s(fault("database-kill", 10.5, 11), fault("rolling-restart", 10, 12)) == [(9.4, 12)]
+
+
+def streamed(stored: list[int], acknowledged: dict[str, Any]) -> list[str]:
+    """Findings in a history whose three samples came in two items each, of which the last was not acknowledged."""
+    acknowledged = {"stream": 1, "after": 0, "seq": 5, "stored": 5, "not_stored": {}} | acknowledged
+    operations = [
+        Operation("", "stream-item", "streams-2", {"sample": (seq + 1) // 2, "stream": 1}, 0, S, status, None)
+        for seq, status in zip(range(1, 7), [200] * 5 + [None], strict=True)
+    ]
+    operations += [
+        Operation("", "acknowledgement", "streams-2", acknowledged, S, S, 200, None),
+        Operation("", "list-streamed", "streams-2", {}, S, S, 200, [[at(one), one] for one in stored]),
+    ]
+    return list(streamed_samples_are_stored_exactly_once(History(operations, [])))
+
+
+def test_acknowledged_items_are_stored_once_or_counted_as_unpaired() -> None:
+    assert streamed([1, 2], {}) == streamed([1, 2, 3], {}) == []
+    assert streamed([1], {"stored": 3, "not_stored": {"REASON_UNPAIRED": 2}}) == []
+    assert "is not stored" in streamed([1], {})[0]
+    assert "stored 2 times" in streamed([1, 1, 2], {})[0]
+    assert "never sent" in streamed([1, 2, 4], {})[0]
+    assert "tells of 4 items" in streamed([1, 2], {"stored": 4})[0]
+    assert "REASON_REFUSED" in streamed([1, 2], {"not_stored": {"REASON_REFUSED": 1}})[0]
 
 
 def test_a_figure_that_grows_is_told_from_one_that_varies() -> None:

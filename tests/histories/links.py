@@ -46,9 +46,18 @@ class Network:
         self._loop.call_soon_threadsafe(link.end_all)
 
     def stop(self) -> None:
-        """Ends the loop."""
+        """Ends all connections and the loop."""
+        self.run(end_other_tasks())
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
+
+
+async def end_other_tasks() -> None:
+    """Ends what else runs on the loop."""
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)
 
 
 class Link:

@@ -421,7 +421,9 @@ def _keeps_from_queueing(outage: Interval, end: Interval) -> bool:
     """Whether a fault kept the node that ends from bringing positions into the outbox."""
     if outage.kind in (*ON_LINKS_TO_DATABASE, "node-stop"):
         return outage.node == end.node or end.kind == "rolling-restart"
-    return outage.kind in (*ON_DATABASE, "full-disk", "fail-over")
+    # An orderly end waits for a slow disk.
+    is_slow = outage.kind == "slow-disk" and end.kind == "node-kill"
+    return is_slow or outage.kind in (*ON_DATABASE, "full-disk", "fail-over")
 
 
 def a_camera_has_one_owner(history: History) -> Iterable[str]:

@@ -47,12 +47,14 @@ def windows_s(*faults: Interval) -> list[tuple[float, float]]:
 def test_a_kill_excuses_its_last_moment_and_the_outage_before_it() -> None:
     assert windows_s(fault("node-kill", 10, 12)) == [(9.4, 12)]
     assert windows_s(fault("full-disk", 8, 9), fault("node-kill", 10, 12)) == [(7.4, 12)]
+    assert windows_s(fault("slow-disk", 8, 9), fault("node-kill", 10, 12)) == [(7.4, 12)]
     assert windows_s(fault("node-stop", 8, 9), fault("node-kill", 10, 12)) == [(7.4, 12)]
     assert windows_s(fault("node-stop", 8, 9, node=2), fault("node-kill", 10, 12)) == [(9.4, 12)]
 
 
 def test_an_orderly_end_excuses_nothing_but_outages() -> None:
     assert windows_s(fault("node-restart", 10, 12)) == []
+    assert windows_s(fault("slow-disk", 9, 11), fault("node-restart", 10, 12)) == []
     assert windows_s(fault("database-kill", 9, 11), fault("node-restart", 10, 12)) == [(8.4, 12)]
     assert windows_s(fault("database-kill", 10.5, 11), fault("rolling-restart", 10, 12)) == [(9.4, 12)]
 

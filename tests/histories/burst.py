@@ -3,21 +3,19 @@
 import asyncio
 import contextlib
 import time
-from urllib.parse import urlsplit
 
 #: Requests under way at once.
 AT_ONCE = 200
 TIMEOUT_S = 2.0
 
 
-def burst(url: str, key: str, duration_s: float) -> None:
+def burst(port: int, key: str, duration_s: float) -> None:
     """Asks for a profile, again and again, as often as answers come."""
-    host = urlsplit(url)
     request = (
-        f"GET /v1/cameras/profile HTTP/1.1\r\nhost: {host.netloc}\r\nauthorization: Bearer {key}\r\n"
+        f"GET /v1/cameras/profile HTTP/1.1\r\nhost: 127.0.0.1:{port}\r\nauthorization: Bearer {key}\r\n"
         "connection: close\r\n\r\n"
     )
-    asyncio.run(_ask_all(host.port or 0, request.encode(), time.monotonic() + duration_s))
+    asyncio.run(_ask_all(port, request.encode(), time.monotonic() + duration_s))
 
 
 async def _ask_all(port: int, request: bytes, end_s: float) -> None:

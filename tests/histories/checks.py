@@ -421,8 +421,8 @@ def _keeps_from_queueing(outage: Interval, end: Interval) -> bool:
     """Whether a fault kept the node that ends from bringing positions into the outbox."""
     if outage.kind in (*ON_LINKS_TO_DATABASE, "node-stop"):
         return outage.node == end.node or end.kind == "rolling-restart"
-    # An orderly end waits for a slow disk.
-    is_slow = outage.kind == "slow-disk" and end.kind == "node-kill"
+    # An orderly end waits for a slow disk, and for its turn after a burst.
+    is_slow = outage.kind in ("slow-disk", "burst") and end.kind == "node-kill"
     return is_slow or outage.kind in (*ON_DATABASE, "full-disk", "fail-over")
 
 

@@ -268,7 +268,9 @@ class Nemesis:
             time.sleep(4 * PAUSE_S)
 
     def _burst(self, fault: Fault) -> None:
-        wanted = (self._cluster.url, self._cluster.admin_key, min(max(fault.duration_s, 1.0), 3.0))
+        # Straight to the node: the links carry the nodes' own connections, too.
+        port = self._cluster.serving[fault.node % len(self._cluster.serving)].listens_at
+        wanted = (port, self._cluster.admin_key, min(max(fault.duration_s, 1.0), 3.0))
         client = multiprocessing.get_context("spawn").Process(target=burst, args=wanted)
         client.start()
         client.join()

@@ -40,7 +40,8 @@ AUDITED = {
 #: Of these, those that change nothing when they are sent again.
 REPEATED = ("start-run", "revoke-key")
 #: Operations that change nothing.
-READS = ("read-profile", "read-active", "fuse", "use-key", "list-runs", "probe-read", "event", "watch")
+MESSAGES = ("event", "watch")
+READS = ("read-profile", "read-active", "fuse", "use-key", "list-runs", "probe-read", *MESSAGES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +71,8 @@ def without_lost_changes(history: History) -> History:
 
     kept = []
     for operation in history.operations:
-        if not is_inside(operation):
+        # A message that came stays so: the next one follows it.
+        if operation.action in MESSAGES or not is_inside(operation):
             kept.append(operation)
         elif operation.action not in READS and operation.client != "final":
             kept.append(dataclasses.replace(operation, status=None))

@@ -32,10 +32,10 @@ def test_a_seed_gives_the_same_faults_again_and_another_one_others() -> None:
 
 def test_an_asynchronous_fail_over_may_undo_changes_of_its_time_only() -> None:
     before, during = operation("import", 1, 2), operation("import", 10, 11)
-    seen = operation("read-profile", 10, 11)
-    history = History([before, during, seen], [fault("fail-over", 10.5, 12)], "asynchronous")
+    seen, came = operation("read-profile", 10, 11), operation("event", 10, 11)
+    history = History([before, during, seen, came], [fault("fail-over", 10.5, 12)], "asynchronous")
     kept = without_lost_changes(history).operations
-    assert [one.is_done for one in kept] == [True, False]
+    assert [(one.action, one.is_done) for one in kept] == [("import", True), ("import", False), ("event", True)]
     synchronous = History(history.operations, history.intervals, "synchronous")
     assert without_lost_changes(synchronous) == synchronous
 

@@ -6,7 +6,9 @@ import json
 import signal
 import sys
 import time
+from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from .backends import REPLICATIONS, DataFolder, PostgreSQL
 from .checks import History, check
@@ -36,6 +38,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--nodes", type=int, default=3, help="server processes on postgres, 1 to 5; a folder has one")
     parser.add_argument("--replication", choices=REPLICATIONS, default="none", help="of postgres, with fail-overs")
     parser.add_argument("--kinds", nargs="*", default=[], help="only these kinds of faults")
+    parser.add_argument("--next", type=Path, metavar="BINARY", help="upgrade: rolling restarts start this one")
     parser.add_argument("--out", type=Path, help="folder of the history; must not exist")
     parser.add_argument("--check", type=Path, metavar="FOLDER", help="only check the history of a folder again")
     parser.add_argument("--planted", action="store_true", help="no faults: break promises on purpose, and find that")
@@ -52,14 +55,20 @@ def checked(folder: Path, options: Options, of_processes: list[str]) -> dict[str
         "faults": len(intervals), "operations": len(operations), "unknown": sum(one.is_unknown for one in operations),
         "refused": sum(one.is_refused for one in operations),
     }  # fmt: skip
-    report = {"options": dataclasses.asdict(options), **counts, "findings": found}
-    (folder / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    done = Counter(one.action for one in operations if one.is_done)
+    write_report(folder, options, {**counts, "done": done, "findings": found})
     print(", ".join(f"{name} {count}" for name, count in counts.items()), f"of seed {options.seed}: {folder}")
     for name, findings in found.items():
         print(f"  {'FOUND' if findings else 'holds'}  {name.replace('_', ' ')}")
         for finding in findings[:MOST_PRINTED]:
             print(f"         {finding}")
     return found
+
+
+def write_report(folder: Path, options: Options, content: dict[str, Any]) -> None:
+    """Writes what is known of a run, and with which options it was made."""
+    report = {"options": dataclasses.asdict(options), **content}
+    (folder / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 
 def check_again(folder: Path) -> bool:
@@ -99,14 +108,18 @@ def main() -> int:
             return 0 if check_again(given.check) else 1
         most = DataFolder.most_nodes if given.backend == "folder" else PostgreSQL.most_nodes
         options = Options(
-            given.seed, given.faults, given.backend, min(given.nodes, most), given.replication, given.kinds, SETTLE_S
-        )
+            given.seed, given.faults, given.backend, min(given.nodes, most), given.replication, given.kinds, SETTLE_S,
+            str(given.next.resolve()) if given.next else None,
+        )  # fmt: skip
         new = ROOT / "target" / "histories" / f"{given.backend}-{given.seed}-{int(time.time())}"
         folder = (given.out or new).resolve()
         if given.soak is not None:
             return 0 if soak(options, folder, given.soak) else 1
         if given.planted:
             return 0 if find_planted(dataclasses.replace(options, faults=0, settle_s=PLANTED_S), folder) else 1
+        # What clients of a run saw that is ended early can be checked, too.
+        folder.mkdir(parents=True)
+        write_report(folder, options, {"findings": {PROCESSES: []}})
         return 1 if any(checked(folder, options, make_history(options, folder, [])).values()) else 0
     except HarnessError as error:
         print(f"the run could not be made: {error}", file=sys.stderr)

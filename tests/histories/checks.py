@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from .backends import PostgreSQL
+from .client import at
 from .cluster import RUN_LEASE_S
 from .nemesis import ENDS_LEASES, ON_DATABASE, ON_LINKS_TO_DATABASE, Interval
 from .record import FOREVER_NS, Operation, by_subject, of_action
 from .registers import ANYTHING, RegisterOperation, SearchTooLargeError, first_contradiction
-from .workloads import ROWS_PER_BATCH, at
+from .workloads import ROWS_PER_BATCH
 
 SECOND_NS = 1_000_000_000
 #: For how long a node may go on with what it last read of the database, s: the lease of a node (keys), or its poll
@@ -27,6 +28,8 @@ RENEWED_S = 2.0
 LIVE = ("queued", "running", "cancelling")
 #: Faults that fail a run for good: no space for its version, or five attempts that ended with their workers.
 FAILURES = ("is full", "no space", "given up")
+#: Why an acknowledged item of a sample in two items need not be stored.
+UNPAIRED = ("REASON_UNPAIRED", "REASON_TOO_LATE")
 ENDED = ("succeeded", "failed", "cancelled")
 #: Changes that have an entry in the audit log, and its action.
 AUDITED = {
@@ -37,7 +40,8 @@ AUDITED = {
 #: Of these, those that change nothing when they are sent again.
 REPEATED = ("start-run", "revoke-key")
 #: Operations that change nothing.
-READS = ("read-profile", "read-active", "fuse", "use-key", "list-runs", "probe-read", "event", "watch")
+MESSAGES = ("event", "watch")
+READS = ("read-profile", "read-active", "fuse", "use-key", "list-runs", "probe-read", *MESSAGES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +71,8 @@ def without_lost_changes(history: History) -> History:
 
     kept = []
     for operation in history.operations:
-        if not is_inside(operation):
+        # A message that came stays so: the next one follows it.
+        if operation.action in MESSAGES or not is_inside(operation):
             kept.append(operation)
         elif operation.action not in READS and operation.client != "final":
             kept.append(dataclasses.replace(operation, status=None))
@@ -98,6 +103,45 @@ def samples_are_stored_exactly_once(history: History) -> Iterable[str]:
         for key, count in found.items():
             if key not in sent or count > 1:
                 yield f"{camera}: sample {key} is stored {count} times, and was{'' if key in sent else ' never'} sent"
+
+
+def streamed_samples_are_stored_exactly_once(history: History) -> Iterable[str]:
+    """Every sample whose items are acknowledged is stored once, but for items that are counted as not stored."""
+    items, acknowledgements = by_subject(history.of("stream-item")), by_subject(history.of("acknowledgement"))
+    for listing in history.of("list-streamed"):
+        camera, found = listing.subject, Counter((row[0], row[1]) for row in listing.answer)
+        sent: dict[tuple[str, int], list[Operation]] = defaultdict(list)
+        for item in items.get(camera, []):
+            sent[at(item.arguments["sample"]), item.arguments["sample"]].append(item)
+        for key, count in found.items():
+            if key not in sent or count > 1:
+                yield f"{camera}: sample {key} is stored {count} times, and was{'' if key in sent else ' never'} sent"
+        left = _counted_as_unpaired(acknowledgements.get(camera, []))
+        for key, parts in sent.items():
+            if found[key] == 0 and all(part.is_done for part in parts):
+                stream = parts[-1].arguments["stream"]
+                left[stream] -= 1
+                if left[stream] < 0:
+                    yield f"{camera}: sample {key} was acknowledged on stream {stream} and is not stored"
+        yield from _unaccounted(camera, acknowledgements.get(camera, []))
+
+
+def _unaccounted(camera: str, acknowledgements: list[Operation]) -> Iterable[str]:
+    """Acknowledgements that say of fewer items what became of them than they acknowledge."""
+    for one in acknowledgements:
+        settled = one.arguments["stored"] + sum(one.arguments["not_stored"].values())
+        if settled < one.arguments["seq"] - one.arguments["after"]:
+            yield f"{camera}: {one.arguments} tells of {settled} items"
+        if unknown := set(one.arguments["not_stored"]) - {*UNPAIRED, "REASON_DUPLICATE"}:
+            yield f"{camera}: items were not stored: {unknown}"
+
+
+def _counted_as_unpaired(acknowledgements: list[Operation]) -> Counter[int]:
+    """Items by stream of which the server says that they found no partner."""
+    counts: Counter[int] = Counter()
+    for one in acknowledgements:
+        counts[one.arguments["stream"]] = sum(one.arguments["not_stored"].get(reason, 0) for reason in UNPAIRED)
+    return counts
 
 
 def judged(name: str, initial: Any, operations: list[RegisterOperation]) -> Iterable[str]:
@@ -379,7 +423,9 @@ def _keeps_from_queueing(outage: Interval, end: Interval) -> bool:
     """Whether a fault kept the node that ends from bringing positions into the outbox."""
     if outage.kind in (*ON_LINKS_TO_DATABASE, "node-stop"):
         return outage.node == end.node or end.kind == "rolling-restart"
-    return outage.kind in (*ON_DATABASE, "full-disk", "fail-over")
+    # An orderly end waits for a slow disk, and for its turn after a burst.
+    is_slow = outage.kind in ("slow-disk", "burst") and end.kind == "node-kill"
+    return is_slow or outage.kind in (*ON_DATABASE, "full-disk", "fail-over")
 
 
 def a_camera_has_one_owner(history: History) -> Iterable[str]:
@@ -427,7 +473,8 @@ def all_nodes_agree_at_the_end(history: History) -> Iterable[str]:
 def every_kind_of_request_was_answered(history: History) -> Iterable[str]:
     """Each kind of request was done at least once: a promise that nobody asked for was not tried."""
     done = Counter(one.action for one in history.operations if one.is_done)
-    wanted = {one.action for one in history.operations} | {*AUDITED, *READS, "publish", "delivery", "list-samples"}
+    messages = ("publish", "delivery", "stream-item", "list-samples", "list-streamed")
+    wanted = {one.action for one in history.operations} | {*AUDITED, *READS, *messages}
     yield from (f"no {action} was done" for action in sorted(wanted) if not done[action])
 
 
@@ -437,10 +484,11 @@ def json_key(answer: Any) -> str:
 
 
 CHECKS: tuple[Callable[[History], Iterable[str]], ...] = (
-    samples_are_stored_exactly_once, profiles_are_linearizable, active_models_are_linearizable,
-    fusions_use_a_recent_model, keys_work_from_creation_to_revocation, runs_end_once, live_runs_are_not_taken_over,
-    the_audit_log_has_exactly_the_changes, events_are_complete_or_marked_lost, positions_are_delivered_under_stable_ids,
-    a_camera_has_one_owner, all_nodes_agree_at_the_end, every_kind_of_request_was_answered,
+    samples_are_stored_exactly_once, streamed_samples_are_stored_exactly_once, profiles_are_linearizable,
+    active_models_are_linearizable, fusions_use_a_recent_model, keys_work_from_creation_to_revocation, runs_end_once,
+    live_runs_are_not_taken_over, the_audit_log_has_exactly_the_changes, events_are_complete_or_marked_lost,
+    positions_are_delivered_under_stable_ids, a_camera_has_one_owner, all_nodes_agree_at_the_end,
+    every_kind_of_request_was_answered,
 )  # fmt: skip
 #: Findings of one check that are listed.
 MOST_FINDINGS = 20

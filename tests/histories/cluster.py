@@ -1,4 +1,4 @@
-"""The servers of a run: nodes and workers, each with own ways to the database and from clients, and a balancer."""
+"""The servers of a run, each with own links to the database, from clients and from other nodes, and a balancer."""
 
 import functools
 import http.client
@@ -19,6 +19,8 @@ NODE_LEASE_S = 2
 RUN_LEASE_S = 5
 #: Longest orderly end of a node, s.
 DRAIN_S = 4
+#: What nodes do with requests for cameras of other nodes, by turns.
+ON_OTHER_NODE = ("proxy", "redirect")
 #: The database does not answer, or its disk is full: the server asks for a start later.
 EXITS_TO_TRY_AGAIN = (3, 4)
 FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1")
@@ -36,6 +38,8 @@ class Node:
         self.name = f"node-{number}"
         self.listens_at = free_port()
         self.from_clients = network.link(lambda: self.listens_at)
+        #: Its advertised address: for other nodes, and for clients that they redirect.
+        self.from_nodes = network.link(lambda: self.listens_at)
         self.to_database = network.link(backend.port) if isinstance(backend, PostgreSQL) else None
         self.log = folder / f"{self.name}.log"
         self.starts = 0
@@ -72,8 +76,9 @@ class Node:
         }  # fmt: skip
         database = self._backend.arguments(self.to_database.port if self.to_database else 0)
         command = [environment["SIGHTFIX"], "serve", "--listen", f"127.0.0.1:{self.listens_at}",
-                   "--advertise", self.url, *database]  # fmt: skip
-        own = {"SIGHTFIX_ROLE": self.role} | (clock if FAKETIME.exists() else {})
+                   "--advertise", f"http://127.0.0.1:{self.from_nodes.port}", *database]  # fmt: skip
+        own = {"SIGHTFIX_ROLE": self.role, "SIGHTFIX_CAMERA_ON_OTHER_NODE": ON_OTHER_NODE[self.number % 2]}
+        own |= clock if FAKETIME.exists() else {}
         return Process(command, self.log, environment | own, self._folder)
 
     def _is_up(self, environment: dict[str, str]) -> bool:
@@ -136,9 +141,11 @@ class Cluster:
     """All servers of a run."""
 
     def __init__(
-        self, binary: Path, folder: Path, backend: DataFolder | PostgreSQL, roles: list[str], settings: dict[str, str]
-    ) -> None:
+        self, binary: Path, folder: Path, backend: DataFolder | PostgreSQL, roles: list[str], settings: dict[str, str],
+        next_binary: str | None = None,
+    ) -> None:  # fmt: skip
         self.backend = backend
+        self.next_binary = next_binary
         self.network = Network()
         self.admin_key = checked(binary, "keys", "generate")
         self.environment = {
@@ -160,6 +167,14 @@ class Cluster:
     def url(self) -> str:
         """Where clients reach any node."""
         return f"http://127.0.0.1:{self.balancer.port}"
+
+    def restart_all(self) -> None:
+        """Ends and starts one node after the other, with the next program if there is one."""
+        if self.next_binary is not None:
+            self.environment["SIGHTFIX"] = self.next_binary
+        for node in self.nodes:
+            node.terminate()
+            node.start(self.environment)
 
     def until_ready(self) -> None:
         """Waits until every serving node says that it is ready."""

@@ -46,9 +46,18 @@ class Network:
         self._loop.call_soon_threadsafe(link.end_all)
 
     def stop(self) -> None:
-        """Ends the loop."""
+        """Ends all connections and the loop."""
+        self.run(end_other_tasks())
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
+
+
+async def end_other_tasks() -> None:
+    """Ends what else runs on the loop."""
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)
 
 
 class Link:
@@ -90,6 +99,11 @@ class Link:
             writer.transport.abort()
 
     async def _accepted(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        # Python 3.11 reports a task of a server that is cancelled.
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._carry(reader, writer)
+
+    async def _carry(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._writers.add(writer)
         try:
             await self._flows.wait()

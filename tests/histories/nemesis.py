@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import multiprocessing
 import random
 import shutil
 import threading
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from .backends import PostgreSQL
+from .burst import burst
 from .cluster import Cluster, Node
 from .links import Link
 from .processes import PAUSE_S
@@ -28,7 +30,9 @@ SLOW_FLUSHES_S = (0.02, 0.1, 0.5)
 #: For how long before a fail-over an asynchronous standby has received nothing, s.
 LAGS_S = (0.0, 0.5, 1.5)
 
-ON_NODES = ("node-kill", "node-stop", "node-restart", "clients-cut", "clients-reset", "clients-delay", "clock-jump")
+ON_NODES = ("node-kill", "node-stop", "node-restart", "clients-cut", "clients-reset", "clients-delay", "clock-jump",
+            "burst")  # fmt: skip
+ON_LINKS_BETWEEN_NODES = ("nodes-cut", "nodes-reset", "nodes-delay")
 ON_LINKS_TO_DATABASE = ("database-cut", "database-reset", "database-delay")
 ON_DATABASE = ("database-kill", "database-stop", "database-terminate")
 #: Faults that may end a lease.
@@ -79,6 +83,7 @@ def amount_of(kind: str, chance: random.Random) -> float:
     amounts = {
         "clock-jump": CLOCK_OFFSETS_S,
         "clients-delay": DELAYS_S,
+        "nodes-delay": DELAYS_S,
         "database-delay": DELAYS_S,
         "fail-over": LAGS_S,
         "slow-disk": SLOW_FLUSHES_S,
@@ -90,8 +95,10 @@ def kinds_for(cluster: Cluster, has_clock: bool) -> list[str]:
     """The kinds of faults that can be injected here."""
     backend = cluster.backend
     kinds = [kind for kind in ON_NODES if kind != "clock-jump" or has_clock]
-    if len(cluster.nodes) > 1:
+    if len(cluster.nodes) > 1 or cluster.next_binary is not None:
         kinds.append("rolling-restart")
+    if len(cluster.serving) > 1:
+        kinds += ON_LINKS_BETWEEN_NODES
     if backend.disk.is_own:
         kinds.append("full-disk")
         if shutil.which("strace"):
@@ -120,7 +127,8 @@ class Nemesis:
             "database-cut": self._cut, "database-reset": self._reset, "database-delay": self._delay,
             "database-kill": self._database_kill, "database-stop": self._database_stop,
             "database-terminate": self._database_terminate, "fail-over": self._fail_over,
-            "slow-disk": self._slow_disk,
+            "slow-disk": self._slow_disk, "nodes-cut": self._cut, "nodes-reset": self._reset,
+            "nodes-delay": self._delay, "burst": self._burst,
         }  # fmt: skip
 
     def run(self, faults: list[Fault]) -> None:
@@ -170,16 +178,18 @@ class Nemesis:
             return {"database"} if isinstance(self._cluster.backend, PostgreSQL) else {"database", node}
         if fault.kind == "rolling-restart":
             return {one.name for one in self._cluster.nodes}
-        if fault.kind.startswith("clients-"):
-            return {f"clients of {node}"}
-        return {f"database of {node}"} if fault.kind in ON_LINKS_TO_DATABASE else {node}
+        if fault.kind == "burst":
+            return {"burst"}
+        way = fault.kind.partition("-")[0]
+        return {f"{way} of {node}"} if way in ("clients", "nodes", "database") else {node}
 
     def _node(self, fault: Fault) -> Node:
         return self._cluster.nodes[fault.node % len(self._cluster.nodes)]
 
     def _link(self, fault: Fault) -> Link:
         node = self._node(fault)
-        link = node.from_clients if fault.kind.startswith("clients-") else node.to_database
+        links = {"clients": node.from_clients, "nodes": node.from_nodes, "database": node.to_database}
+        link = links[fault.kind.partition("-")[0]]
         if link is None:
             raise ValueError(f"{fault.kind} needs a database with a way to it")
         return link
@@ -205,9 +215,7 @@ class Nemesis:
         self._node(fault).start(self._cluster.environment)
 
     def _rolling_restart(self, _fault: Fault) -> None:
-        for node in self._cluster.nodes:
-            node.terminate()
-            node.start(self._cluster.environment)
+        self._cluster.restart_all()
 
     def _clock_jump(self, fault: Fault) -> None:
         self._node(fault).set_clock(fault.amount)
@@ -258,6 +266,14 @@ class Nemesis:
         while time.monotonic() < end:
             self._postgres.end_connections()
             time.sleep(4 * PAUSE_S)
+
+    def _burst(self, fault: Fault) -> None:
+        # Straight to the node: the links carry the nodes' own connections, too.
+        port = self._cluster.serving[fault.node % len(self._cluster.serving)].listens_at
+        wanted = (port, self._cluster.admin_key, min(max(fault.duration_s, 1.0), 3.0))
+        client = multiprocessing.get_context("spawn").Process(target=burst, args=wanted)
+        client.start()
+        client.join()
 
     def _fail_over(self, fault: Fault) -> None:
         if fault.amount > 0 and self._postgres.replication == "asynchronous":

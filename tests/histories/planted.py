@@ -9,9 +9,13 @@ import http.client
 import json
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
+from urllib.parse import urlsplit
+
+import grpc
 
 from .api import exchange
 
@@ -63,7 +67,8 @@ class Plant:
     check: str
     method: str
     path: str
-    #: Between clients and the balancer, between a sink and its receiver, or as another address of a node.
+    #: Between clients and the balancer (for streams over gRPC one of its own), between a sink and its receiver, or as
+    #: another address of a node.
     place: str
     break_it: "Callable[[Plant, Request, Forward], Answer]"
     #: It touches one in this number of the requests that it could touch.
@@ -174,6 +179,7 @@ def plants() -> list[Plant]:
         Plant(
             "lost-sample", "samples_are_stored_exactly_once", "POST", "/samples-1/samples$", clients, _import_nothing
         ),
+        Plant("lost-item", "streamed_samples_are_stored_exactly_once", "", "^$", "streams", _pass_on),
         Plant("stale-profile", "profiles_are_linearizable", "GET", "/cameras/profile$", clients, _answer_of_before),
         Plant("lost-update", "profiles_are_linearizable", "PATCH", "/cameras/profile$", clients, _change_any_revision),
         Plant("stale-model", "active_models_are_linearizable", "GET", active, clients, _answer_of_before),
@@ -292,3 +298,22 @@ class Proxy:
                     if not drops or count % EVERY:
                         client.wfile.write(event)
                     event = b""
+
+
+class StreamProxy:
+    """Passes streams over gRPC on to another address, without some of their items: the next ones are acknowledged."""
+
+    def __init__(self, target: str) -> None:
+        self._channel = grpc.insecure_channel(urlsplit(target).netloc)
+        self._server = grpc.server(ThreadPoolExecutor())
+        handlers: dict[str, Any] = {"Stream": grpc.stream_stream_rpc_method_handler(self._stream)}
+        service = grpc.method_handlers_generic_handler("sightfix.v1.FusionService", handlers)
+        self._server.add_generic_rpc_handlers([service])
+        self.url = f"http://127.0.0.1:{self._server.add_insecure_port('127.0.0.1:0')}"
+        self._server.start()
+
+    def _stream(self, requests: Iterator[bytes], context: grpc.ServicerContext) -> Iterator[bytes]:
+        # The first message opens the stream.
+        kept = (request for number, request in enumerate(requests, 1) if number % EVERY)
+        forward: Any = self._channel.stream_stream("/sightfix.v1.FusionService/Stream")
+        yield from forward(kept, metadata=context.invocation_metadata())

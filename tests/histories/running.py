@@ -14,13 +14,14 @@ from typing import Any
 
 from .api import Api
 from .backends import DataFolder, PostgreSQL
+from .client import Setting, Ways
 from .cluster import FAKETIME, Cluster, random_roles
 from .links import free_port
 from .nemesis import Nemesis, draw, kinds_for
-from .planted import Plant, Proxy
+from .planted import Plant, Proxy, StreamProxy
 from .processes import HarnessError, until
 from .record import Recorder
-from .workloads import Setting, names, prepare, run, runs_of
+from .workloads import STORING, names, prepare, run, runs_of
 
 ROOT = Path(__file__).resolve().parents[2]
 MODEL = ROOT / "models" / "demo-square.safetensors"
@@ -49,15 +50,8 @@ class Options:
     kinds: list[str]
     #: Without faults before the clients end: whatever was under way comes to its end, s.
     settle_s: float
-
-
-@dataclasses.dataclass(frozen=True)
-class Ways:
-    """Where clients reach the servers, and where the servers reach the receiver of webhooks."""
-
-    url: str
-    node_urls: list[str]
-    hook_port: int
+    #: The program from the first rolling restart on, where it is another one.
+    next: str | None = None
 
 
 def binary() -> Path:
@@ -115,9 +109,10 @@ def read_final_state(cluster: Cluster, ways: Ways, folder: Path) -> None:
     until(lambda: not any(run[1] in ("queued", "running", "cancelling") for run in final_runs(unrecorded, runs)),
           "every run ends", END_S)  # fmt: skip
     until(lambda: is_delivered(cluster, unrecorded), "the outbox is empty", END_S)
-    for camera in (name for name in names() if name.startswith("samples-")):
+    for camera in (name for name in names() if name.startswith(STORING)):
         rows = pages(unrecorded, f"/v1/cameras/{camera}/samples")
-        recorder.note("list-samples", camera, {}, [[row["time"], row["bounding_box"]["left_px"]] for row in rows])
+        found = [[row["time"], row["bounding_box"]["left_px"]] for row in rows]
+        recorder.note("list-samples" if camera.startswith(STORING[0]) else "list-streamed", camera, {}, found)
     recorder.note("final-runs", "runs", {}, final_runs(unrecorded, runs))
     outcomes = [[run["id"], run["outcome"]] for run in pages(unrecorded, runs) if run["state"] == "failed"]
     recorder.note("final-failures", "runs", {}, outcomes)
@@ -168,7 +163,7 @@ def servers(options: Options, folder: Path, settings: dict[str, str]) -> Iterato
     (folder / "history").mkdir(parents=True)
     backend = DataFolder(folder) if options.backend == "folder" else PostgreSQL(folder, options.replication)
     try:
-        cluster = Cluster(program, folder, backend, random_roles(options.nodes), settings)
+        cluster = Cluster(program, folder, backend, random_roles(options.nodes), settings, options.next)
         try:
             yield cluster
         finally:
@@ -203,9 +198,12 @@ def make_history(options: Options, folder: Path, planted: list[Plant]) -> list[s
 def through(planted: list[Plant], cluster: Cluster, hook_port: int) -> Ways:
     """The ways of clients and webhooks, through the plants on them."""
     nodes = [node.url for node in cluster.serving]
-    at = {place: [plant for plant in planted if plant.place == place] for place in ("clients", "hook", "node")}
+    at = {
+        place: [plant for plant in planted if plant.place == place] for place in ("clients", "streams", "hook", "node")
+    }
     return Ways(
         Proxy(cluster.url, at["clients"]).url if at["clients"] else cluster.url,
+        StreamProxy(cluster.url).url if at["streams"] else cluster.url,
         [*nodes, *([Proxy(nodes[0], at["node"]).url] if at["node"] else [])],
         Proxy(f"http://127.0.0.1:{hook_port}", at["hook"]).port if at["hook"] else hook_port,
     )
@@ -257,10 +255,7 @@ def clients_at_work(options: Options, cluster: Cluster, ways: Ways, folder: Path
     api = Api(cluster.url, cluster.admin_key, Recorder(history / "setup.ndjson", "setup"), timeout_s=30)
     prepare(api, MODEL.read_bytes(), training_rows(binary(), folder), ways.hook_port)
     clients = Clients(
-        [
-            Setting(name, ways.url, ways.node_urls, cluster.admin_key, options.seed, history, EPOCHS, hook_port)
-            for name in names()
-        ]
+        [Setting(name, ways, cluster.admin_key, options.seed, history, EPOCHS, hook_port) for name in names()]
     )
     try:
         yield clients

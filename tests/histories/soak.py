@@ -12,7 +12,7 @@ from .cluster import Cluster
 from .links import free_port
 from .record import Recorder
 from .running import Options, clients_at_work, servers, through
-from .workloads import names
+from .workloads import STORING, names
 
 #: So small that all are reached in the first third of a soak of a minute, and rows come and go from then on.
 SETTINGS = {
@@ -21,8 +21,12 @@ SETTINGS = {
     "SIGHTFIX_LIMITS__ENDED_RUNS_PER_CAMERA": "3", "SIGHTFIX_LIMITS__MODELS_PER_CAMERA": "8",
     "SIGHTFIX_LIMITS__IDEMPOTENCY_KEYS": "50",
 }  # fmt: skip
-#: Lines of the table.
-LINES = 12
+#: Points of the picture, and every which of them is a line of the table.
+POINTS = 60
+POINTS_PER_LINE = 5
+#: Width and height of a panel of the picture, and its margin.
+PANEL_PX = 200
+MARGIN_PX = 24
 #: What a figure of the last third may be above that of the second one, as a share and in its unit.
 GROWTH = {"memory (MB)": (0.10, 8.0), "descriptors": (0.10, 16.0), "rows": (0.02, 20.0), "disk (MB)": (0.10, 8.0)}
 
@@ -43,7 +47,7 @@ def memory_mb(process: int) -> float:
 
 def stored_rows(api: Api) -> int:
     """Rows of all that the clients change: samples, keys, runs, model versions and entries of the audit log."""
-    cameras = [name for name in names() if name.startswith("samples-")]
+    cameras = [name for name in names() if name.startswith(STORING)]
     counts = [_answer(api, f"/v1/cameras/{camera}/samples/count")["count"] for camera in cameras]
     lists = ["/v1/keys", "/v1/audit", "/v1/cameras/runs/training-runs", "/v1/cameras/runs/models"]
     return int(sum(counts)) + sum(len(_answer(api, f"{path}?limit=1000")["items"]) for path in lists)
@@ -69,27 +73,54 @@ def measure(cluster: Cluster, api: Api, began_s: float) -> Figures:
 
 
 def soak(options: Options, folder: Path, duration_s: float) -> bool:
-    """Measures while the clients work, and prints the table; whether all figures stay flat."""
-    lines: list[Figures] = []
+    """Measures while the clients work, prints the table and draws `soak.svg`; whether all figures stay flat."""
+    points: list[Figures] = []
     with servers(options, folder, SETTINGS) as cluster:
         hook_port = free_port()
         api = Api(cluster.url, cluster.admin_key, Recorder(Path(os.devnull), "soak"), timeout_s=30)
         with clients_at_work(options, cluster, through([], cluster, hook_port), folder, hook_port) as clients:
             began_s = time.monotonic()
-            for line in range(1, LINES + 1):
-                time.sleep(max(0.0, began_s + line * duration_s / LINES - time.monotonic()))
-                lines.append(measure(cluster, api, began_s))
+            for point in range(1, POINTS + 1):
+                time.sleep(max(0.0, began_s + point * duration_s / POINTS - time.monotonic()))
+                points.append(measure(cluster, api, began_s))
             clients.end()
-    return report(lines)
+    (folder / "soak.svg").write_text(picture(points), encoding="utf-8")
+    return report(points)
 
 
-def report(lines: list[Figures]) -> bool:
+def picture(points: list[Figures]) -> str:
+    """A panel for each figure over the time, from 0 on, as SVG."""
+    panels = "".join(panel(name, points, number) for number, name in enumerate(GROWTH))
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {len(GROWTH) * PANEL_PX} {PANEL_PX}" '
+        f'font-family="sans-serif" font-size="11">\n{panels}</svg>\n'
+    )
+
+
+def panel(name: str, points: list[Figures], number: int) -> str:
+    """The panel of one figure: its name, its largest value and the time at the ends of the axes, and a line."""
+    size, left, most = PANEL_PX - 2 * MARGIN_PX, number * PANEL_PX + MARGIN_PX, max(one.values[name] for one in points)
+    until_s, bottom = points[-1].time_s, PANEL_PX - MARGIN_PX
+    line = " ".join(
+        f"{left + size * one.time_s / until_s:.1f},{bottom - size * one.values[name] / (most or 1.0):.1f}"
+        for one in points
+    )
+    return (
+        f'<rect x="{left}" y="{MARGIN_PX}" width="{size}" height="{size}" fill="#fff" stroke="#888"/>\n'
+        f'<polyline points="{line}" fill="none" stroke="#06c" stroke-width="1.5"/>\n'
+        f'<g fill="#888"><text x="{left}" y="{MARGIN_PX - 6}">{name}, up to {most:.0f}</text>\n'
+        f'<text x="{left}" y="{bottom + 14}">0</text>'
+        f'<text x="{left + size}" y="{bottom + 14}" text-anchor="end">{until_s:.0f} s</text></g>\n'
+    )
+
+
+def report(points: list[Figures]) -> bool:
     """Prints the table, and which figures have grown; whether none has."""
     names_of = list(GROWTH)
     print(f"| time (s) | {' | '.join(names_of)} |\n|---:|{'---:|' * len(names_of)}")
-    for line in lines:
+    for line in points[POINTS_PER_LINE - 1 :: POINTS_PER_LINE]:
         print(f"| {line.time_s:.0f} | {' | '.join(f'{line.values[name]:.0f}' for name in names_of)} |")
-    grown = [name for name in names_of if has_grown(name, [line.values[name] for line in lines])]
+    grown = [name for name in names_of if has_grown(name, [line.values[name] for line in points])]
     print(f"grown: {', '.join(grown)}" if grown else "flat: no figure of the last third is above that of the second")
     return not grown
 

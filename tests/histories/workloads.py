@@ -1,28 +1,22 @@
 """Clients, each a process of its own: one does one kind of thing, over and over, until it is told to end."""
 
 import contextlib
-import dataclasses
-import datetime
 import http.client
 import itertools
 import json
-import random
 import threading
 import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing.synchronize import Event
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from .api import Api
-from .record import Recorder
+from .client import BOX, FIX, Client, Setting, at
+from .streams import stream_samples
 
-START = datetime.datetime(2020, 1, 1, tzinfo=datetime.UTC)
-FIX = {"longitude_deg": 103.98678, "latitude_deg": 30.628, "sigma_m": 1.5}
 JSON = "application/json"
-BOX = {"left_px": 475, "top_px": 11, "width_px": 28, "height_px": 77}
 ROWS_PER_BATCH = 3
 #: Model versions of the camera whose active version changes.
 VERSIONS = 6
@@ -30,50 +24,8 @@ VERSIONS = 6
 KEY_USES = 12
 #: Silence after which a reader of events opens a new stream, s.
 EVENT_SILENCE_S = 4.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Setting:
-    """What a client knows: where the servers are, its key, and the seed of its choices."""
-
-    client: str
-    url: str
-    node_urls: list[str]
-    key: str
-    seed: int
-    history: Path
-    epochs: int
-    #: Where webhooks are received.
-    hook_port: int
-
-
-class Client:
-    """What all clients have: an interface that records, choices, and a wish to end."""
-
-    def __init__(self, setting: Setting, ending: Event) -> None:
-        self.setting = setting
-        self.chance = random.Random(f"{setting.seed} {setting.client}")  # noqa: S311
-        self.recorder = Recorder(setting.history / f"{setting.client}.ndjson", setting.client)
-        self.api = Api(setting.url, setting.key, self.recorder)
-        self._ending = ending
-
-    def steps(self, pause_s: float) -> Iterator[int]:
-        """Counts from 1, with pauses of about `pause_s` seconds, until the client is to end."""
-        for step in itertools.count(1):
-            if self._ending.wait(self.chance.uniform(0.5, 1.5) * pause_s):
-                return
-            yield step
-
-    @property
-    def is_ending(self) -> bool:
-        """Whether it is to end."""
-        return self._ending.is_set()
-
-
-def at(seconds: float) -> str:
-    """A time of the past, which no wrong clock takes for the future, as the server writes it."""
-    text, _, fraction = (START + datetime.timedelta(seconds=seconds)).strftime("%Y-%m-%dT%H:%M:%S.%f").partition(".")
-    return text + f".{fraction}".rstrip("0").rstrip(".") + "Z"
+#: Marks a request that came from another node: this one answers it itself.
+SENT_ON = {"x-sightfix-forwarded": "1"}
 
 
 def import_samples(client: Client) -> None:
@@ -209,17 +161,18 @@ def publish(client: Client) -> None:
 def probe_owners(client: Client) -> None:
     """Sends a target of its own to one node after the other, and asks that node which targets it follows.
 
-    Only the owner of the camera answers. What it follows tells since when it is the owner, for a new owner begins anew.
+    Only the owner of the camera answers, for the probes are marked as sent on. What it follows tells since when it is
+    the owner, for a new owner begins anew.
     """
     for number in client.steps(0.05):
-        node = client.chance.choice(client.setting.node_urls)
+        node = client.chance.choice(client.setting.ways.node_urls)
         target = f"{client.setting.client}-{number}"
         observation = {"time": at(number), "target_id": target, "fix": FIX}
         arguments = {"node": node, "target": target}
         client.api.send("probe", "owned", "POST", "/v1/cameras/owned/tracks", {"observations": [observation]},
-                        arguments=arguments, follow=False, base=node)  # fmt: skip
+                        arguments=arguments, headers=SENT_ON, follow=False, base=node)  # fmt: skip
         client.api.send("probe-read", "owned", "GET", "/v1/cameras/owned/tracks", arguments={"node": node},
-                        follow=False, base=node, keep=_targets)  # fmt: skip
+                        headers=SENT_ON, follow=False, base=node, keep=_targets)  # fmt: skip
 
 
 def _targets(answer: Any, _headers: dict[str, str]) -> Any:
@@ -239,7 +192,7 @@ def watch_events(client: Client) -> None:
 
 def _events(client: Client, last: str | None) -> Iterator[dict[str, Any]]:
     """The events of one stream."""
-    url = client.setting.url + "/v1/cameras/yard/events"
+    url = client.setting.ways.url + "/v1/cameras/yard/events"
     for _ in range(4):
         parts = urlsplit(url)
         connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=EVENT_SILENCE_S)
@@ -314,13 +267,15 @@ def receive_hooks(client: Client) -> None:
     server.shutdown()
 
 
+#: Names of the clients that store samples, each of a camera of its own, begin so.
+STORING = ("samples-", "streams-")
 KINDS: dict[str, Callable[[Client], None]] = {
     "samples": import_samples, "profile": change_profile, "active": activate_models, "keys": change_keys,
     "runs": train, "yard": follow_targets, "gate": publish, "owned": probe_owners, "events": watch_events,
-    "hooks": receive_hooks,
+    "streams": stream_samples, "hooks": receive_hooks,
 }  # fmt: skip
 #: How many clients of a kind there are, where it is not one.
-CLIENTS = {"samples": 2, "profile": 3, "active": 3, "keys": 2, "owned": 2}
+CLIENTS = {"samples": 2, "streams": 2, "profile": 3, "active": 3, "keys": 2, "owned": 2}
 
 
 def names() -> list[str]:
@@ -349,7 +304,7 @@ def prepare(api: Api, model: bytes, samples: bytes, hook_port: int) -> None:
         if not done.is_done:
             raise RuntimeError(f"{method} {path}: {done.status} {done.answer}")
 
-    cameras = [name for name in names() if name.startswith("samples-")]
+    cameras = [name for name in names() if name.startswith(STORING)]
     for camera in [*cameras, "profile", "active", "runs", "yard", "gate", "owned"]:
         must("create-camera", camera, "POST", "/v1/cameras", {"id": camera})
     for _ in range(VERSIONS):

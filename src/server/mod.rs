@@ -57,6 +57,8 @@ use tls::Tls;
 /// How often metrics are gathered, and the registry looks for what another process on the same file
 /// has changed.
 const REFRESH_EVERY: Duration = Duration::from_secs(2);
+/// Time that the end of the store gets after the requests have ended.
+const CLOSE_LIMIT: Duration = Duration::from_secs(5);
 
 /// A server that listens but does not answer yet.
 pub struct Server {
@@ -230,7 +232,10 @@ impl Server {
         if !shutdown.drain_with_timeout(config.limits.drain_time()).await {
             tracing::warn!("requests that did not end within limits.drain_s were dropped");
         }
-        app.close().await;
+        // Everything that was acknowledged is stored; a database that does not answer would hold the end up.
+        if tokio::time::timeout(CLOSE_LIMIT, app.close()).await.is_err() {
+            tracing::warn!("the store could not be closed in time");
+        }
         tracing::info!("shut down");
         Ok(())
     }

@@ -1,6 +1,6 @@
 //! The state in memory of one camera that exists, from its creation to its deletion.
 
-use std::sync::atomic::{AtomicI64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
@@ -81,6 +81,8 @@ pub(in crate::app) struct CameraLive {
     replaced: CancellationToken,
     /// The fence under which it was changed last; 0 before the first.
     tenure: AtomicI64,
+    /// True if the next fence may have been given to another node as well.
+    may_have_gap: AtomicBool,
 }
 
 impl CameraLive {
@@ -99,6 +101,7 @@ impl CameraLive {
             deleted: CancellationToken::new(),
             replaced: CancellationToken::new(),
             tenure: AtomicI64::new(0),
+            may_have_gap: AtomicBool::new(false),
         })
     }
 
@@ -120,7 +123,14 @@ impl CameraLive {
     /// Takes the fence of a new tenure; false if another node may have had the camera since the one before.
     pub(in crate::app) fn continue_under(&self, fence: i64) -> bool {
         let before = self.tenure.swap(fence, Ordering::AcqRel);
-        before == 0 || before + 1 == fence
+        let may_have_gap = self.may_have_gap.swap(false, Ordering::AcqRel);
+        before == 0 || before + 1 == fence && !may_have_gap
+    }
+
+    /// The database continues from an earlier state: it may give fences again that it had given before, so the next one does
+    /// not tell whether another node had the camera.
+    pub(in crate::app) fn note_gap(&self) {
+        self.may_have_gap.store(true, Ordering::Release);
     }
 
     /// True if a later tenure than that of this state has begun.

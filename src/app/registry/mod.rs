@@ -239,9 +239,10 @@ impl Registry {
     }
 
     /// Lets the next refresh read every camera and its model again: the database's history has changed, in which
-    /// revisions and versions are given out again.
+    /// revisions, versions and fences are given out again.
     pub(super) fn distrust(&self) {
         self.is_distrusted.store(true, Ordering::Release);
+        self.cameras.load().values().for_each(|camera| camera.live.note_gap());
     }
 
     /// Loads cameras as they are stored, with models that are known already unless they are distrusted; whether all
@@ -509,5 +510,21 @@ mod tests {
             assert!(registry.get(&id).is_none());
             assert!(camera.live.is_deleted(), "what listens to the camera ends");
         }
+    }
+
+    #[tokio::test]
+    async fn tenures_do_not_continue_over_a_break_of_the_databases_history() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let store = Store::open(folder.path()).await.expect("a new store");
+        let (registry, id) = (Registry::default(), CameraId::new("yard").expect("a slug"));
+        store.insert_camera(&NewCamera::named(id.clone()), Timestamp::UNIX_EPOCH).await.expect("new");
+        let key = registry.refresh_camera(&store, &id).await.expect("known").key;
+        assert!(!registry.begin_tenure(&id, key, 4).await, "the first");
+        assert!(!registry.begin_tenure(&id, key, 5).await, "no other node had it in between");
+        // A fail-over undoes fence 5, which another node gets.
+        registry.distrust();
+        assert!(registry.begin_tenure(&id, key, 6).await, "it begins anew");
+        assert!(!registry.begin_tenure(&id, key, 7).await, "no break since");
+        assert!(registry.begin_tenure(&id, key, 9).await, "another node had it");
     }
 }

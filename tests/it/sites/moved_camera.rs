@@ -10,8 +10,8 @@ use super::training::{feed, has_ended, samples_csv, start, until};
 use crate::harness::{TestServer, data_folder};
 
 const CAMERAS: [&str; 3] = ["c1", "c2", "c3"];
-/// What the second camera is knocked by, px of 1,920.
-const KNOCK_PX: f64 = 60.0;
+/// What the second camera is knocked by, image widths: 60 px of 1,920.
+const KNOCK: f64 = 1.0 / 32.0;
 
 /// Three cameras that see one place; the walkers of each seed are others.
 fn site(seed: u64, duration_s: f64) -> SimulatedSite {
@@ -31,8 +31,9 @@ async fn create(server: &TestServer, site: &SimulatedSite) {
     }
 }
 
-/// The second camera turns to the left in the middle.
+/// The second camera turns to the left in the middle; it sees no box that leaves the image.
 fn knocked(mut site: SimulatedSite) -> SimulatedSite {
+    let width_px = f64::from(site.image_size.width_px());
     let detections = &mut site.cameras[1].detections;
     let middle = detections[detections.len() / 2].detection.time;
     detections.retain_mut(|own| {
@@ -40,8 +41,9 @@ fn knocked(mut site: SimulatedSite) -> SimulatedSite {
             return true;
         }
         let [left, top, width, height] = own.detection.bounding_box.sides_px();
-        let moved = BoundingBox::new(left + KNOCK_PX, top, width, height);
-        moved.map(|moved| own.detection.bounding_box = moved).is_ok()
+        let left = left + KNOCK * width_px;
+        let moved = BoundingBox::new(left, top, width, height).ok().filter(|_| left + width <= width_px);
+        moved.map(|moved| own.detection.bounding_box = moved).is_some()
     });
     site
 }

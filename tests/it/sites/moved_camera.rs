@@ -74,10 +74,9 @@ async fn a_knocked_camera_is_found_by_the_others_of_its_site() {
         assert!(moved(&server, camera).await.is_null(), "{camera}");
     }
     // Its positions say so, and state the shift as an error.
-    let observation =
-        json!({"bounding_box": {"left_px": 900.0, "top_px": 500.0, "width_px": 40.0, "height_px": 110.0}});
-    let fusion =
-        server.post("/v1/cameras/c2/fusions", &json!({"observations": [observation]})).await.expect(200);
-    let flags = &fusion.json()["results"][0]["flags"];
-    assert!(flags.as_array().expect("flags").contains(&json!("camera_moved")), "{flags}");
+    let sides = json!({"left_px": 600.0, "top_px": 330.0, "width_px": 27.0, "height_px": 73.0});
+    let observation = json!({"time": "2026-02-01T12:00:00Z", "bounding_box": sides});
+    let answer = server.post("/v1/cameras/c2/fusions", &json!({"observations": [observation]})).await;
+    let fused = answer.expect(200).json()["items"][0].clone();
+    assert!(fused["flags"].to_string().contains("camera_moved"), "{fused}");
 }

@@ -6,7 +6,7 @@
 //! z_a - z_b - v (t_a - t_b) = -(o_a - o_b) v + m(x) + w
 //! ```
 //!
-//! with the difference m of their maps at the target's position x and the noise w ([`MapDifference`]). What one target shows
+//! with the difference m of their maps at the target's position x and the noise w (`map_difference.rs`). What one target shows
 //! within some seconds is one observation: v is the line through the positions by both cameras, for the velocity of the track
 //! follows each camera's map. Because m depends on x, a difference of the maps that people meet on opposite sides of a street is
 //! not taken for one of the clocks. The offsets of all cameras are the least-squares solution of their pairs; most clocks are

@@ -6,7 +6,7 @@
 //! d = m(x) + b + v o + 1[t >= onset] s + w
 //! ```
 //!
-//! with the difference m of the maps, what a target keeps b, and the difference o of the clocks ([`MapDifference`]). If camera c was moved by s_c,
+//! with the difference m of the maps, what a target keeps b, and the difference o of the clocks (`map_difference.rs`). If camera c was moved by s_c,
 //! the steps of its pairs are s_c and those of all others are 0. The evidence for it is twice the logarithm of the likelihood
 //! ratio against no step,
 //!
@@ -22,9 +22,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Matrix2xX, Vector2};
 
-use super::comparisons::{CameraPair, Comparisons, LongDifference, Observation};
-use super::frame::WorldTrackId;
-use super::map_difference::Regressor;
+use super::comparisons::{CameraPair, Comparisons, LongDifference};
+use super::frame::{MovedCamera, WorldTrackId};
+use super::map_difference::{Observation, Regressor};
 use crate::domain::CameraId;
 use crate::geo::EastNorth;
 
@@ -38,29 +38,6 @@ const LEAST_TARGETS: usize = 3;
 const LEAST_LEAD: f64 = 40.0;
 /// Least shift, m.
 const LEAST_SHIFT_M: f64 = 0.3;
-
-/// A camera whose positions are shifted beside those of the site's other cameras.
-#[derive(Debug, Clone, PartialEq)]
-pub struct MovedCamera {
-    /// The camera.
-    pub camera: CameraId,
-    /// Start of the first observation with the shift.
-    pub onset_at: Timestamp,
-    /// Mean shift of its positions, m.
-    pub shift: EastNorth,
-    /// Twice the logarithm of the likelihood ratio.
-    pub statistic: f64,
-    /// Targets compared since the onset.
-    pub targets: usize,
-}
-
-impl MovedCamera {
-    /// Error variance per axis that the move adds to that of the camera's map, m2: half the squared shift.
-    #[must_use]
-    pub fn change_variance_m2(&self) -> f64 {
-        0.5 * (self.shift.east_m.powi(2) + self.shift.north_m.powi(2))
-    }
-}
 
 /// The step of a pair of cameras: the first camera's positions beside the second's.
 struct Step {

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use nalgebra::Vector2;
 
 use super::frame::WorldTrackId;
-use super::map_difference::MapDifference;
+use super::map_difference::{MapDifference, Observation};
 use super::world_track::seconds_from;
 use crate::domain::CameraId;
 use crate::geo::EastNorth;
@@ -103,17 +103,6 @@ impl Common {
             position: self.middle / self.comparisons,
         })
     }
-}
-
-/// What a target shows of two cameras within some seconds: its velocity, m/s, its position, m, and what the first camera's
-/// positions are ahead of the second's at equal times, m.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Observation {
-    pub(super) track: WorldTrackId,
-    pub(super) began: Timestamp,
-    pub(super) velocity: Vector2<f64>,
-    pub(super) apart: Vector2<f64>,
-    pub(super) position: Vector2<f64>,
 }
 
 /// A box as it is compared with those of other cameras.

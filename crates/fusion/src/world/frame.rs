@@ -4,7 +4,6 @@ use std::fmt;
 
 use jiff::Timestamp;
 
-use super::camera_moves::MovedCamera;
 use crate::domain::{CameraId, ReceiverId, TargetId};
 use crate::geo::{EastNorth, PlaneCovariance};
 
@@ -94,6 +93,29 @@ pub struct TimedEvent {
     pub time: Timestamp,
     /// The event.
     pub event: WorldEvent,
+}
+
+/// A camera whose positions are shifted beside those of the site's other cameras.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MovedCamera {
+    /// The camera.
+    pub camera: CameraId,
+    /// Start of the first observation with the shift.
+    pub onset_at: Timestamp,
+    /// Mean shift of its positions, m.
+    pub shift: EastNorth,
+    /// Twice the logarithm of the likelihood ratio.
+    pub statistic: f64,
+    /// Targets compared since the onset.
+    pub targets: usize,
+}
+
+impl MovedCamera {
+    /// Error variance per axis that the move adds to that of the camera's map, m2: half the squared shift.
+    #[must_use]
+    pub fn change_variance_m2(&self) -> f64 {
+        0.5 * (self.shift.east_m.powi(2) + self.shift.north_m.powi(2))
+    }
 }
 
 /// The outcome of a frame.

@@ -8,9 +8,10 @@
 //! b is what the target keeps, an exponential process over time. The r_k are regressors, w is noise. The coefficients c_k are the generalized least-squares solution, with observations
 //! that miss the others counting less (Huber).
 
+use jiff::Timestamp;
 use nalgebra::{DMatrix, DVector, Matrix2xX, RowDVector, Vector2};
 
-use super::comparisons::Observation;
+use super::frame::WorldTrackId;
 use super::world_track::seconds_from;
 
 /// Fewest observations.
@@ -31,6 +32,17 @@ const HUBER: f64 = 1.5;
 const LEAST_WEIGHT: f64 = 0.05;
 /// Rounds of reweighting.
 const ROUNDS: usize = 4;
+
+/// What a target shows of two cameras within some seconds: its velocity, m/s, its position, m, and what the first camera's
+/// positions are ahead of the second's at equal times, m.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Observation {
+    pub(super) track: WorldTrackId,
+    pub(super) began: Timestamp,
+    pub(super) velocity: Vector2<f64>,
+    pub(super) apart: Vector2<f64>,
+    pub(super) position: Vector2<f64>,
+}
 
 /// A regressor: two axes for each observation.
 pub(super) type Regressor = Matrix2xX<f64>;

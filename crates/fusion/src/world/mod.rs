@@ -24,9 +24,8 @@ mod tracker;
 mod world_track;
 
 pub use camera_clocks::CameraClock;
-pub use camera_moves::MovedCamera;
 pub use frame::{
-    CameraFrame, FixOutcome, FrameOutcome, TimedEvent, WorldDetection, WorldEvent, WorldTrackId,
+    CameraFrame, FixOutcome, FrameOutcome, MovedCamera, TimedEvent, WorldDetection, WorldEvent, WorldTrackId,
 };
 pub use settings::WorldTrackSettings;
 pub use tracker::WorldTracker;

@@ -14,6 +14,7 @@ from typing import Any
 
 from .api import Api
 from .backends import DataFolder, PostgreSQL
+from .checks import STALE_S
 from .client import Setting, Ways
 from .cluster import FAKETIME, Cluster, random_roles
 from .links import free_port
@@ -121,6 +122,8 @@ def read_final_state(cluster: Cluster, ways: Ways, folder: Path) -> None:
     entries = pages(unrecorded, "/v1/audit")
     log = [[entry.get("request_id"), entry["action"], entry["number"]] for entry in entries]
     recorder.note("final-audit", "", {}, log)
+    # Until now a node may answer by what it read before the last change.
+    time.sleep(STALE_S)
     read_nodes(ways, Api(ways.url, cluster.admin_key, recorder, timeout_s=30))
 
 

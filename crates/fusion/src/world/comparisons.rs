@@ -22,8 +22,13 @@ const ENDED_AFTER_S: f64 = 3.0;
 /// Latest observations of two cameras that count, and those of them that tell of clocks, which may be set at any time.
 const MOST_OBSERVATIONS: usize = 180;
 const MOST_FOR_CLOCKS: usize = 60;
-/// Pairs whose long difference is computed in one look, the one that has waited longest first.
+/// The long difference is computed again after that many observations; of that many pairs in one look, the one that has
+/// waited longest first.
+const LONG_AFTER: usize = 16;
 const MOST_LONG_AT_ONCE: usize = 4;
+/// Rounds of reweighting.
+const SHORT_ROUNDS: usize = 4;
+const LONG_ROUNDS: usize = 2;
 /// Variance of what a target keeps between two cameras, such as the shape of its boxes, in variances of an observation's noise.
 const TARGET_VARIANCE: f64 = 2.0;
 /// Pairs of cameras and targets under way at most.
@@ -125,7 +130,9 @@ pub(super) struct Overlap {
     pub(super) short: Option<MapDifference>,
     /// The same by all that there were when it was computed.
     pub(super) long: Option<LongDifference>,
-    /// Since when `long` waits to be computed again.
+    /// Observations since `long` was computed.
+    new_observations: usize,
+    /// Since when it waits to be computed again.
     waiting_since: Option<Timestamp>,
 }
 
@@ -178,18 +185,21 @@ impl Comparisons {
         let mut changed = BTreeSet::new();
         for ((pair, track), common) in self.under_way.extract_if(.., |_, common| common.is_over(now)) {
             let Some(observation) = common.observation(track) else { continue };
-            let own = &mut self.overlaps.entry(pair.clone()).or_default().observations;
-            own.push(observation);
-            if own.len() > MOST_OBSERVATIONS {
-                own.remove(0);
+            let own = self.overlaps.entry(pair.clone()).or_default();
+            own.new_observations += 1;
+            own.observations.push(observation);
+            if own.observations.len() > MOST_OBSERVATIONS {
+                own.observations.remove(0);
             }
             changed.insert(pair);
         }
         for pair in &changed {
             let Some(own) = self.overlaps.get_mut(pair) else { continue };
             let latest = own.observations.len().saturating_sub(MOST_FOR_CLOCKS);
-            own.short = MapDifference::of(&own.observations[latest..], 0.0);
-            own.waiting_since.get_or_insert(now);
+            own.short = MapDifference::of(&own.observations[latest..], 0.0, SHORT_ROUNDS);
+            if own.new_observations >= LONG_AFTER {
+                own.waiting_since.get_or_insert(now);
+            }
         }
         self.compute_long();
         !changed.is_empty()
@@ -200,9 +210,9 @@ impl Comparisons {
             self.overlaps.values_mut().filter(|own| own.waiting_since.is_some()).collect();
         waiting.sort_by_key(|own| own.waiting_since);
         for own in waiting.into_iter().take(MOST_LONG_AT_ONCE) {
-            own.waiting_since = None;
+            (own.waiting_since, own.new_observations) = (None, 0);
             let observations = own.observations.clone();
-            own.long = MapDifference::of(&observations, TARGET_VARIANCE)
+            own.long = MapDifference::of(&observations, TARGET_VARIANCE, LONG_ROUNDS)
                 .map(|difference| LongDifference { observations, difference });
         }
     }

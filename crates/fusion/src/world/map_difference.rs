@@ -30,8 +30,6 @@ const TARGET_TIME_S: f64 = 60.0;
 /// Observations that miss the others by more than this many standard deviations count less (Huber), down to the least weight.
 const HUBER: f64 = 1.5;
 const LEAST_WEIGHT: f64 = 0.05;
-/// Rounds of reweighting.
-const ROUNDS: usize = 4;
 
 /// What a target shows of two cameras within some seconds: its velocity, m/s, its position, m, and what the first camera's
 /// positions are ahead of the second's at equal times, m.
@@ -74,8 +72,8 @@ pub(super) struct MapDifference {
 
 impl MapDifference {
     /// Of the observations of two cameras, with their weights; `None` if they are too few. `target_variance` is that of what a
-    /// target keeps, in variances of an observation's noise.
-    pub(super) fn of(observations: &[Observation], target_variance: f64) -> Option<Self> {
+    /// target keeps, in variances of an observation's noise; `rounds` are those of reweighting.
+    pub(super) fn of(observations: &[Observation], target_variance: f64, rounds: usize) -> Option<Self> {
         if observations.len() < LEAST_OBSERVATIONS {
             return None;
         }
@@ -93,7 +91,7 @@ impl MapDifference {
         };
         let regressors: Vec<Regressor> = own.velocity.iter().cloned().collect();
         let mut weights = DVector::from_element(observations.len(), 1.0);
-        for _ in 0..ROUNDS {
+        for _ in 0..rounds {
             let noise = DMatrix::from_diagonal(&weights.map(f64::recip));
             own.precision = (&map + noise).cholesky()?.inverse();
             own.of_mean = own.precision.row_sum();

@@ -6,9 +6,9 @@
 //! d = m(x) + b + v o + 1[t >= onset] s + w
 //! ```
 //!
-//! with the difference m of the maps, what a target keeps b, and the difference o of the clocks (`map_difference.rs`). If camera c was moved by s_c,
-//! the steps of its pairs are s_c and those of all others are 0. The evidence for it is twice the logarithm of the likelihood
-//! ratio against no step,
+//! with the difference m of the maps, what a target keeps b, and the difference o of the clocks (`map_difference.rs`). If
+//! camera c was moved by s_c, the steps of its pairs are s_c and those of all others are 0. The evidence for it is twice the
+//! logarithm of the likelihood ratio against no step,
 //!
 //! ```text
 //! L_c = h' W^-1 h,   h = sum_p W_p s_p,   W = sum_p W_p      over the pairs p of c, W_p the precision of the step s_p

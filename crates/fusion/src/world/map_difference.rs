@@ -5,8 +5,8 @@
 //! ```
 //!
 //! d is an observation, m the difference of the maps at the target's position x: a Gaussian process with an unknown mean.
-//! b is what the target keeps, an exponential process over time. The r_k are regressors, w is noise. The coefficients c_k are the generalized least-squares solution, with observations
-//! that miss the others counting less (Huber).
+//! b is what the target keeps, an exponential process over time. The r_k are regressors, w is noise. The coefficients c_k
+//! are the generalized least-squares solution, with observations that miss the others counting less (Huber).
 
 use jiff::Timestamp;
 use nalgebra::{DMatrix, DVector, Matrix2xX, RowDVector, Vector2};

@@ -53,15 +53,19 @@ pub(super) struct CameraMoves {
 }
 
 impl CameraMoves {
-    /// Looks for a camera that was moved; each is returned once.
-    pub(super) fn review(&mut self, comparisons: &Comparisons) -> Option<MovedCamera> {
+    /// Looks for a camera that was moved, among those of the pairs whose long difference is new; each is returned once.
+    pub(super) fn review(&mut self, comparisons: &Comparisons, new: &[CameraPair]) -> Option<MovedCamera> {
+        let candidates: BTreeSet<&CameraId> = new.iter().flat_map(|(one, other)| [one, other]).collect();
+        if candidates.is_empty() {
+            return None;
+        }
         let has_moved =
             |(one, other): &CameraPair| self.found.contains_key(one) || self.found.contains_key(other);
         let known = comparisons.overlaps().iter().filter(|(pair, _)| !has_moved(pair));
         let overlaps: BTreeMap<&CameraPair, &LongDifference> =
             known.filter_map(|(pair, overlap)| Some((pair, overlap.long.as_ref()?))).collect();
         let cameras: BTreeSet<&CameraId> = overlaps.keys().flat_map(|(one, other)| [one, other]).collect();
-        let moved = cameras.iter().find_map(|camera| moved_camera(camera, &cameras, &overlaps))?;
+        let moved = candidates.iter().find_map(|camera| moved_camera(camera, &cameras, &overlaps))?;
         self.found.insert(moved.camera.clone(), moved.shift);
         Some(moved)
     }
@@ -86,8 +90,9 @@ fn moved_camera(
     cameras: &BTreeSet<&CameraId>,
     overlaps: &BTreeMap<&CameraPair, &LongDifference>,
 ) -> Option<MovedCamera> {
-    let own = overlaps.iter().filter(|(pair, _)| is_of(pair, camera));
-    let mut latest: Vec<&Observation> = own.flat_map(|(_, overlap)| &overlap.observations).collect();
+    let (own, rest): (Vec<_>, Vec<_>) =
+        overlaps.iter().map(|(pair, overlap)| (*pair, *overlap)).partition(|(pair, _)| is_of(pair, camera));
+    let mut latest: Vec<&Observation> = own.iter().flat_map(|(_, overlap)| &overlap.observations).collect();
     latest.sort_by_key(|observation| std::cmp::Reverse(observation.began));
     ONSETS.iter().find_map(|&count| {
         let onset_at = latest.get(count - 1)?.began;
@@ -95,9 +100,13 @@ fn moved_camera(
         if targets.len() < LEAST_TARGETS {
             return None;
         }
-        let steps: Vec<(&CameraPair, Step)> =
-            overlaps.iter().filter_map(|(pair, overlap)| Some((*pair, step(overlap, onset_at)?))).collect();
+        let steps_of = |(pair, overlap)| Some((pair, step(overlap, onset_at)?));
+        let mut steps: Vec<(&CameraPair, Step)> = own.iter().copied().filter_map(steps_of).collect();
         let (statistic, shift) = evidence(camera, &steps)?;
+        if statistic < LEAST_LEAD {
+            return None;
+        }
+        steps.extend(rest.iter().copied().filter_map(steps_of));
         let others = cameras.iter().filter(|other| **other != camera);
         let next = others.filter_map(|other| Some(evidence(other, &steps)?.0)).fold(0.0, f64::max);
         let is_certain = statistic - next >= LEAST_LEAD && shift.norm() >= LEAST_SHIFT_M;

@@ -143,6 +143,15 @@ pub(super) struct LongDifference {
     pub(super) difference: MapDifference,
 }
 
+/// What a look for observations that have ended has brought.
+#[derive(Debug, Default)]
+pub(super) struct Review {
+    /// True if there are new observations.
+    pub(super) has_observations: bool,
+    /// The pairs whose long difference was computed again.
+    pub(super) long: Vec<CameraPair>,
+}
+
 /// The comparisons of a site's cameras.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Comparisons {
@@ -175,11 +184,11 @@ impl Comparisons {
         common.add(time, vector(first.position), vector(second.position), stated_s);
     }
 
-    /// Ends observations, at most every two seconds; true if there are new ones.
-    pub(super) fn advance(&mut self, now: Timestamp) -> bool {
+    /// Ends observations, at most every two seconds.
+    pub(super) fn advance(&mut self, now: Timestamp) -> Review {
         let is_early = |reviewed: Timestamp| seconds_from(reviewed, now).abs() < REVIEW_S;
         if self.reviewed.is_some_and(is_early) {
-            return false;
+            return Review::default();
         }
         self.reviewed = Some(now);
         let mut changed = BTreeSet::new();
@@ -201,20 +210,21 @@ impl Comparisons {
                 own.waiting_since.get_or_insert(now);
             }
         }
-        self.compute_long();
-        !changed.is_empty()
+        Review { has_observations: !changed.is_empty(), long: self.compute_long() }
     }
 
-    fn compute_long(&mut self) {
-        let mut waiting: Vec<&mut Overlap> =
-            self.overlaps.values_mut().filter(|own| own.waiting_since.is_some()).collect();
-        waiting.sort_by_key(|own| own.waiting_since);
-        for own in waiting.into_iter().take(MOST_LONG_AT_ONCE) {
+    fn compute_long(&mut self) -> Vec<CameraPair> {
+        let mut waiting: Vec<(&CameraPair, &mut Overlap)> =
+            self.overlaps.iter_mut().filter(|(_, own)| own.waiting_since.is_some()).collect();
+        waiting.sort_by_key(|(_, own)| own.waiting_since);
+        let computed = waiting.into_iter().take(MOST_LONG_AT_ONCE).map(|(pair, own)| {
             (own.waiting_since, own.new_observations) = (None, 0);
             let observations = own.observations.clone();
             own.long = MapDifference::of(&observations, TARGET_VARIANCE, LONG_ROUNDS)
                 .map(|difference| LongDifference { observations, difference });
-        }
+            pair.clone()
+        });
+        computed.collect()
     }
 
     /// Forgets a camera, whose map is another one from now on.

@@ -114,11 +114,12 @@ impl WorldTracker {
     /// positions of a camera that was moved here.
     pub fn observe(&mut self, frame: &CameraFrame) -> FrameOutcome {
         let outcome = self.tracked(&self.moved_back(frame));
-        if !self.comparisons.advance(frame.time) {
-            return outcome;
+        let review = self.comparisons.advance(frame.time);
+        if review.has_observations {
+            self.clocks.estimate(&self.comparisons);
         }
-        self.clocks.estimate(&self.comparisons);
-        FrameOutcome { has_new_clocks: true, moved: self.moves.review(&self.comparisons), ..outcome }
+        let moved = self.moves.review(&self.comparisons, &review.long);
+        FrameOutcome { has_new_clocks: review.has_observations, moved, ..outcome }
     }
 
     /// A camera has another map from now on: what its boxes have shown beside those of other cameras is forgotten.

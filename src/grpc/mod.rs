@@ -34,8 +34,10 @@ mod tracks;
 mod training;
 mod world_tracks;
 
+use bytes::{BufMut as _, Bytes, BytesMut};
 use futures_util::FutureExt as _;
 use hyper::Response;
+use prost::Message as _;
 use tonic::server::NamedService;
 use tonic::service::Routes;
 use tonic_health::ServingStatus;
@@ -62,6 +64,7 @@ use proto::track_service_server::TrackServiceServer;
 use proto::training_service_server::TrainingServiceServer;
 
 pub use statuses::{explain, owner, trailers};
+pub(crate) use stream::HALF_CLOSE_GRACE;
 
 /// Messages, services and clients generated from `proto/`.
 #[expect(clippy::allow_attributes, reason = "generated code")]
@@ -149,6 +152,20 @@ pub fn class(path: &str) -> RequestClass {
         "/sightfix.v1.FusionService/Stream" => RequestClass::LiveStream,
         _ => RequestClass::Other,
     }
+}
+
+/// The message, with its head, by which a live stream that another node answers asks its client to reconnect, because this node
+/// shuts down.
+pub(crate) fn reconnect_message() -> Bytes {
+    let reconnect = proto::StreamReconnect { reason: stream::SERVER_IS_ENDING.to_owned() };
+    let message = proto::StreamResponse { kind: Some(proto::stream_response::Kind::Reconnect(reconnect)) };
+    let message = message.encode_to_vec();
+    // Not compressed, then its length.
+    let mut bytes = BytesMut::with_capacity(5 + message.len());
+    bytes.put_u8(0);
+    bytes.put_u32(message.len() as u32);
+    bytes.put_slice(&message);
+    bytes.freeze()
 }
 
 /// A refusal before any service was asked, as a whole answer.

@@ -22,7 +22,9 @@ use crate::status;
 /// How often age, idle time and the reader are checked.
 const TICK: Duration = Duration::from_secs(1);
 /// Time that a client gets to half-close after it was asked to reconnect.
-const HALF_CLOSE_GRACE: Duration = Duration::from_secs(5);
+pub(crate) const HALF_CLOSE_GRACE: Duration = Duration::from_secs(5);
+/// Why a client is asked to reconnect when the server shuts down.
+pub(super) const SERVER_IS_ENDING: &str = "the server is ending; reconnect to continue the stream";
 /// Items that are answered together, if they are there.
 const BATCH: u32 = 32;
 
@@ -148,7 +150,7 @@ impl StreamSession {
                 biased;
                 error = stream.ended() => return Err(error),
                 () = self.shutdown.draining(), if clock.reconnect_sent_at.is_none() => {
-                    self.outbox.reconnect("the server is ending; reconnect to continue the stream");
+                    self.outbox.reconnect(SERVER_IS_ENDING);
                     clock.reconnect_sent_at = Some(Instant::now());
                 }
                 _ = tick.tick() => {

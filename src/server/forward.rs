@@ -18,7 +18,7 @@ use bytes::Bytes;
 use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 use http_body_util::BodyExt as _;
-use hyper::body::{Body as HttpBody, Frame};
+use hyper::body::{Body as HttpBody, Frame, Incoming};
 use hyper::client::conn::http2;
 use hyper::header::{CONNECTION, COOKIE, HOST, LOCATION, TE, TRANSFER_ENCODING, UPGRADE};
 use hyper::http::request::Parts;
@@ -33,6 +33,7 @@ use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 
 use super::activity::GRPC_STATUS;
+use super::forwarded_answer::ForwardedAnswer;
 use super::proxies::{X_FORWARDED_FOR, X_FORWARDED_PROTO};
 use crate::admission::{Lease, RequestClass};
 use crate::domain::Error;
@@ -93,15 +94,26 @@ impl Forwarder {
             return Ok(here);
         };
         let Some(body) = record.replay() else { return Ok(here) };
-        // The client of a live stream opens it again elsewhere after the last acknowledgement.
         let body = if is_live { body.ended_by(self.shutdown.clone()) } else { body };
-        Ok(self.send(&owner, head, body).await.unwrap_or_else(|error| {
-            tracing::warn!(%owner, error = format!("{error:#}"), "a request could not be sent on to the node that has its camera");
-            here
-        }))
+        match self.send(&owner, head, body).await {
+            Ok(answer) => Ok(answer.map(|body| self.passed_on(body, context))),
+            Err(error) => {
+                tracing::warn!(%owner, error = format!("{error:#}"), "a request could not be sent on to the node that has its camera");
+                Ok(here)
+            }
+        }
     }
 
-    async fn send(&self, owner: &Uri, head: Parts, body: Replay) -> anyhow::Result<Response<Body>> {
+    fn passed_on(&self, body: Incoming, context: &RequestContext) -> Body {
+        if !context.is_grpc() {
+            return Body::new(body);
+        }
+        let answer = ForwardedAnswer::new(body, context.clone());
+        let is_live = context.class() == RequestClass::LiveStream;
+        Body::new(if is_live { answer.until_drained(self.shutdown.clone()) } else { answer })
+    }
+
+    async fn send(&self, owner: &Uri, head: Parts, body: Replay) -> anyhow::Result<Response<Incoming>> {
         let opened =
             tokio::time::timeout(OPEN_TIME, self.open(owner)).await.context("no connection in time")?;
         let (mut sender, connection) = http2::handshake(TokioExecutor::new(), TokioIo::new(opened?)).await?;
@@ -115,8 +127,7 @@ impl Forwarder {
         *request.method_mut() = head.method;
         *request.uri_mut() = Uri::from_parts(uri)?;
         *request.headers_mut() = head.headers;
-        let response = sender.send_request(request).await?;
-        Ok(response.map(Body::new))
+        Ok(sender.send_request(request).await?)
     }
 
     async fn open(&self, owner: &Uri) -> anyhow::Result<Box<dyn ByteStream>> {
@@ -297,9 +308,14 @@ struct Replay {
 }
 
 impl Replay {
-    /// Ends the body once this node drains: the other one then settles the stream and ends it in order.
+    /// Ends the body of a live stream once this node drains and the client, which is asked to reconnect, has had time to end
+    /// it: the other node then settles the stream and ends it in order.
     fn ended_by(self, shutdown: Shutdown) -> Self {
-        Self { end: Some(Box::pin(async move { shutdown.draining().await })), ..self }
+        let end = async move {
+            shutdown.draining().await;
+            tokio::time::sleep(grpc::HALF_CLOSE_GRACE).await;
+        };
+        Self { end: Some(Box::pin(end)), ..self }
     }
 }
 

@@ -13,6 +13,7 @@ mod connection_gate;
 mod cors;
 mod credentials;
 mod forward;
+mod forwarded_answer;
 mod frame_limit;
 mod guarded_stream;
 mod host_check;

@@ -3,10 +3,14 @@
 use std::path::Path;
 
 use serde_json::json;
+use sightfix::simulation::Options;
+use tonic::Code;
+use tonic_types::StatusExt as _;
 
 use super::feed::{Feed, PACE};
 use super::{assert_stored_once, create, fence, items, url};
 use crate::harness::{TestServer, data_folder};
+use crate::live_client::{Client, Received, boxed, channel, fixed, open, rows, whole};
 
 /// A serving process that sends on what another one answers.
 fn proxying_node(folder: &Path) -> TestServer {
@@ -58,6 +62,53 @@ async fn a_node_sends_on_what_the_owner_of_the_camera_answers() {
     assert!(terminated.await.expect("no panic"), "it ends in order");
     assert_eq!(fence(folder.path(), "yard"), 1, "the owner stays");
     assert_stored_once(&first, &feed).await;
+}
+
+/// A stream of the camera `yard` at a node, which sends it on to the owner, another one.
+async fn sent_on(owner: &TestServer, node: &TestServer) -> Client {
+    create(owner, &json!({"id": "yard"})).await;
+    let first = open(&channel(owner).await, "the first", false).await;
+    assert_eq!(first.finish().await.2, None, "it has the camera now");
+    open(&channel(node).await, "the second", true).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn the_client_of_a_stream_that_is_sent_on_ends_it_after_a_whole_sample() {
+    let folder = data_folder();
+    let (owner, second) = (proxying_node(folder.path()), proxying_node(folder.path()));
+    let rows = rows(&Options { seed: 5, samples: 100, targets: 1, ..Options::demo() });
+    let mut client = sent_on(&owner, &second).await;
+    client.item(whole(&rows[0])).await;
+    client.item(boxed(&rows[1])).await;
+    for _ in 0..2 {
+        client.answer().await;
+    }
+    let terminated = tokio::task::spawn_blocking(move || second.terminate());
+    while !matches!(client.next().await.expect("no end"), Some(Received::Reconnect(_))) {}
+    client.item(fixed(&rows[1])).await;
+    let (acknowledgement, answers, ended) = client.finish_with_counts().await;
+    let acknowledgement = acknowledgement.expect("all is acknowledged");
+    assert_eq!((acknowledgement.seq, acknowledgement.stored), (3, 3), "{acknowledgement:?}");
+    assert_eq!((answers.len(), ended), (1, None));
+    assert!(terminated.await.expect("no panic"), "it ends in order");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs PostgreSQL: .ci/postgres"]
+async fn a_stream_whose_owner_is_killed_ends_as_unavailable() {
+    let folder = data_folder();
+    let (mut owner, second) = (proxying_node(folder.path()), proxying_node(folder.path()));
+    let mut client = sent_on(&owner, &second).await;
+    owner.kill_now();
+    let ended = loop {
+        match client.next().await {
+            Ok(message) => assert!(message.is_some(), "no end in order"),
+            Err(status) => break status,
+        }
+    };
+    let reason = ended.get_details_error_info().expect("details").reason;
+    assert_eq!((ended.code(), &*reason), (Code::Unavailable, "camera-between-nodes"), "{ended:?}");
 }
 
 /// The owner's address is that of a process which does not exist any more.

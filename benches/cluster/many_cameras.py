@@ -1,21 +1,23 @@
-"""The costs of nodes of one cluster with many cameras: start, memory, idle polls, and activation on every node.
+"""The costs of many cameras: start and memory of a node, and in a cluster idle polls and activation on every node.
 
-Usage: python3 benches/cluster/many_cameras.py URL [CAMERAS]
+Usage: python3 benches/cluster/many_cameras.py PLACE [CAMERAS]
 
-URL is an empty PostgreSQL database on this machine, or one that an earlier run has filled; psql and a release build are needed (SIGHTFIX, by default
-target/release/sightfix). One simulated camera is trained; the others have a copy of its model. Three nodes answer, two
-processes train. Prints a Markdown table.
+PLACE is the URL of an empty PostgreSQL database on this machine (psql is needed), or a data folder, or one of these that an earlier run has filled. A release
+build is needed (SIGHTFIX, by default target/release/sightfix). One simulated camera is trained; the others have a copy of its model. On PostgreSQL
+three nodes answer and two processes train. Prints a Markdown table.
 """
 
 import json
 import os
 import socket
+import sqlite3
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 import urllib.request
+from contextlib import closing
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -23,15 +25,15 @@ SERVING, TRAINING = 3, 2
 IDLE_S = 20
 ACTIVATIONS = 20
 LONGEST_S = 30
+STARTS = 9
 TICKS = os.sysconf("SC_CLK_TCK")
 BINARY = os.environ.get("SIGHTFIX", "target/release/sightfix")
 
 COPIES = """
-INSERT INTO cameras (id, display_name, image_width_px, image_height_px, gnss_sigma_m, gnss_bias_sigma_m, recipe, target_classes,
-    labels, receivers, retrain_when_moved, site_key, updated_at_us, created_at_us, revision, last_model_number)
-SELECT 'copy-' || number, display_name, image_width_px, image_height_px, gnss_sigma_m, gnss_bias_sigma_m, recipe, target_classes,
-    labels, receivers, retrain_when_moved, site_key, updated_at_us, created_at_us, revision, last_model_number
-FROM cameras, generate_series(2, {cameras}) AS numbers (number) WHERE id = 'trained';
+WITH RECURSIVE numbers (number) AS (SELECT 2 UNION ALL SELECT number + 1 FROM numbers WHERE number < {cameras})
+INSERT INTO cameras (id, profile, learn_automatically, updated_at_us, created_at_us, revision, last_model_number)
+SELECT 'copy-' || number, profile, learn_automatically, updated_at_us, created_at_us, revision, last_model_number
+FROM cameras, numbers WHERE id = 'trained';
 INSERT INTO sample_counts (camera_key, samples, without_fix) SELECT key, 0, 0 FROM cameras WHERE id LIKE 'copy-%';
 INSERT INTO models (camera_key, number, created_at_us, metadata, weights, sha256)
 SELECT cameras.key, number, models.created_at_us, metadata, weights, sha256 FROM models, cameras
@@ -41,9 +43,17 @@ ANALYZE;
 """
 
 
-def sql(url: str, statement: str) -> str:
+def is_folder(place: str) -> bool:
+    return "://" not in place
+
+
+def sql(place: str, statement: str) -> str:
+    if is_folder(place):
+        with closing(sqlite3.connect(Path(place) / "sightfix.db")) as database:
+            database.executescript(statement)
+        return ""
     answer = subprocess.run(
-        ["psql", url, "-v", "ON_ERROR_STOP=1", "-AtqX", "-c", statement], check=True, text=True, stdout=subprocess.PIPE
+        ["psql", place, "-v", "ON_ERROR_STOP=1", "-AtqX", "-c", statement], check=True, text=True, stdout=subprocess.PIPE
     )
     return answer.stdout.strip()
 
@@ -52,14 +62,24 @@ def sightfix(*arguments: str, **environment: str) -> None:
     subprocess.run([BINARY, "--quiet", *arguments], check=True, env=os.environ | environment, stdout=subprocess.DEVNULL)
 
 
-def fill(url: str, cameras: int) -> None:
+def stored_in(place: str) -> dict[str, str]:
+    return {"SIGHTFIX_DATA" if is_folder(place) else "SIGHTFIX_DATABASE": place}
+
+
+def is_filled(place: str) -> bool:
+    if is_folder(place):
+        return Path(place).exists()
+    return sql(place, "SELECT to_regclass('cameras') IS NULL") == "f"
+
+
+def fill(place: str, cameras: int) -> None:
     """One trained camera, and copies of it."""
     with tempfile.TemporaryDirectory() as folder:
         sightfix("simulate", "square", "--out", f"{folder}/train.csv", "--seed", "7")
-        sightfix("import", f"{folder}/train.csv", "--camera", "trained", "--create", SIGHTFIX_DATABASE=url)
+        sightfix("import", f"{folder}/train.csv", "--camera", "trained", "--create", **stored_in(place))
         for seed in ["1", "2"]:
-            sightfix("train", "--camera", "trained", "--seed", seed, SIGHTFIX_DATABASE=url)
-    sql(url, COPIES.format(cameras=cameras))
+            sightfix("train", "--camera", "trained", "--seed", seed, **stored_in(place))
+    sql(place, COPIES.format(cameras=cameras))
 
 
 def free_port() -> int:
@@ -71,7 +91,7 @@ def free_port() -> int:
 class Node:
     """A process of the cluster."""
 
-    def __init__(self, url: str, role: str, folder: Path, cameras: int) -> None:
+    def __init__(self, place: str, role: str, folder: Path, cameras: int) -> None:
         self.port = free_port()
         settings = folder / f"{self.port}.toml"
         settings.write_text(f'role = "{role}"\n[limits]\ncameras = {2 * cameras}\n')
@@ -79,7 +99,7 @@ class Node:
         with (folder / f"{self.port}.log").open("w") as log:
             self.process = subprocess.Popen(
                 [BINARY, "--config", str(settings), "serve", "--listen", f"127.0.0.1:{self.port}"],
-                env=os.environ | {"SIGHTFIX_DATABASE": url},
+                env=os.environ | stored_in(place),
                 stdout=log,
                 stderr=log,
             )
@@ -146,46 +166,64 @@ def activations(nodes: list[Node]) -> list[float]:
     return seconds
 
 
+def of_one_node(folder: str, settings: Path, cameras: int) -> None:
+    started, computed, resident = [], [], []
+    for _ in range(STARTS):
+        node = Node(folder, "both", settings, cameras)
+        started.append(node.wait())
+        computed.append(node.cpu_s())
+        resident.append(node.resident_mib())
+        node.process.terminate()
+        node.process.wait(30)
+    print(f"| {cameras:,} cameras, {STARTS} starts of one node | median | least | most |\n|---|---:|---:|---:|")
+    for title, values in [("until it is ready, s", started), ("CPU time, s", computed), ("memory, MiB", resident)]:
+        print(f"| {title} | {statistics.median(values):.2f} | {min(values):.2f} | {max(values):.2f} |")
+
+
+def of_a_cluster(url: str, settings: Path, cameras: int) -> None:
+    nodes, workers = [Node(url, "serve", settings, cameras)], []
+    alone_s = nodes[0].wait()
+    print(f"| {cameras:,} cameras, {SERVING} serving and {TRAINING} training processes | |\n|---|---:|")
+    print(f"| start of a serving node until it is ready | {alone_s:.1f} s |")
+    print(f"| of it CPU time of the node | {nodes[0].cpu_s():.1f} s |")
+    try:
+        nodes += [Node(url, "serve", settings, cameras) for _ in range(SERVING - 1)]
+        workers = [Node(url, "train", settings, cameras) for _ in range(TRAINING)]
+        with ThreadPoolExecutor() as waiting:
+            started = list(waiting.map(Node.wait, [*nodes[1:], *workers]))
+        nodes_s, workers_s = started[: SERVING - 1], started[SERVING - 1 :]
+        print(f"| start of {SERVING - 1} more at once, slowest | {max(nodes_s):.1f} s |")
+        print(f"| start of {TRAINING} training processes beside them, slowest | {max(workers_s):.1f} s |")
+        print(f"| memory of a serving node | {nodes[0].resident_mib():.0f} MiB |")
+        print(f"| memory of a training process | {workers[0].resident_mib():.0f} MiB |")
+        time.sleep(5)
+        before = [node.cpu_s() for node in [*nodes, *workers]], postgres_cpu_s()
+        time.sleep(IDLE_S)
+        after = [node.cpu_s() for node in [*nodes, *workers]], postgres_cpu_s()
+        idle = [100 * (late - early) / IDLE_S for early, late in zip(before[0], after[0])]
+        print(f"| idle: CPU of a serving node | {statistics.mean(idle[:SERVING]):.1f} % of a core |")
+        print(f"| idle: CPU of a training process | {statistics.mean(idle[SERVING:]):.1f} % of a core |")
+        database = 100 * (after[1] - before[1]) / IDLE_S
+        print(f"| idle: CPU of the database for all {SERVING + TRAINING} | {database:.1f} % of a core |")
+        seconds = sorted(activations(nodes))
+        print(
+            f"| activation until all serving nodes answer by it, {len(seconds)} times, p50 and slowest "
+            f"| {statistics.median(seconds):.1f} s, {seconds[-1]:.1f} s |"
+        )
+    finally:
+        for node in [*nodes, *workers]:
+            node.process.terminate()
+        for node in [*nodes, *workers]:
+            node.process.wait(30)
+
+
 def main() -> None:
-    url, cameras = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 100_000
-    if sql(url, "SELECT to_regclass('cameras') IS NULL") == "t":
-        fill(url, cameras)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        nodes, workers = [Node(url, "serve", folder, cameras)], []
-        alone_s = nodes[0].wait()
-        print(f"| {cameras:,} cameras, {SERVING} serving and {TRAINING} training processes | |\n|---|---:|")
-        print(f"| start of a serving node until it is ready | {alone_s:.1f} s |")
-        print(f"| of it CPU time of the node | {nodes[0].cpu_s():.1f} s |")
-        try:
-            nodes += [Node(url, "serve", folder, cameras) for _ in range(SERVING - 1)]
-            workers = [Node(url, "train", folder, cameras) for _ in range(TRAINING)]
-            with ThreadPoolExecutor() as waiting:
-                started = list(waiting.map(Node.wait, [*nodes[1:], *workers]))
-            nodes_s, workers_s = started[: SERVING - 1], started[SERVING - 1 :]
-            print(f"| start of {SERVING - 1} more at once, slowest | {max(nodes_s):.1f} s |")
-            print(f"| start of {TRAINING} training processes beside them, slowest | {max(workers_s):.1f} s |")
-            print(f"| memory of a serving node | {nodes[0].resident_mib():.0f} MiB |")
-            print(f"| memory of a training process | {workers[0].resident_mib():.0f} MiB |")
-            time.sleep(5)
-            before = [node.cpu_s() for node in [*nodes, *workers]], postgres_cpu_s()
-            time.sleep(IDLE_S)
-            after = [node.cpu_s() for node in [*nodes, *workers]], postgres_cpu_s()
-            idle = [100 * (late - early) / IDLE_S for early, late in zip(before[0], after[0])]
-            print(f"| idle: CPU of a serving node | {statistics.mean(idle[:SERVING]):.1f} % of a core |")
-            print(f"| idle: CPU of a training process | {statistics.mean(idle[SERVING:]):.1f} % of a core |")
-            database = 100 * (after[1] - before[1]) / IDLE_S
-            print(f"| idle: CPU of the database for all {SERVING + TRAINING} | {database:.1f} % of a core |")
-            seconds = sorted(activations(nodes))
-            print(
-                f"| activation until all serving nodes answer by it, {len(seconds)} times, p50 and slowest "
-                f"| {statistics.median(seconds):.1f} s, {seconds[-1]:.1f} s |"
-            )
-        finally:
-            for node in [*nodes, *workers]:
-                node.process.terminate()
-            for node in [*nodes, *workers]:
-                node.process.wait(30)
+    place, cameras = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 100_000
+    if not is_filled(place):
+        fill(place, cameras)
+    with tempfile.TemporaryDirectory() as settings:
+        measure = of_one_node if is_folder(place) else of_a_cluster
+        measure(place, Path(settings), cameras)
 
 
 main()

@@ -4,7 +4,7 @@ use bytes::Bytes;
 use jiff::Timestamp;
 
 use super::active_cameras::ActiveCameras;
-use super::registry::{ModelFault, Registry, load_model, unusable};
+use super::registry::{ModelFault, Registry, unusable};
 use super::{App, Page, page_of};
 use crate::clock::Clock;
 use crate::domain::{Camera, CameraId, Error, ErrorKind, ModelFormat, ModelVersion, Result};
@@ -275,7 +275,9 @@ impl Models<'_> {
     /// # Errors
     /// `CameraNotFound`, `ModelNotFound`; `ModelUnusable` if the stored version cannot be loaded.
     pub async fn activate(&self, id: &CameraId, number: u32) -> Result<Camera> {
-        load_model(id, number, self.store.model_content(id, number).await?)?;
+        let (metadata, weights) = self.store.model_content(id, number).await?;
+        let artifact = Artifact { metadata, weights: weights.into() };
+        artifact.load().map_err(|error| unusable(id, number, error))?;
         let camera = self.store.activate_model(id, number, self.clock.now()).await?;
         self.registry.refresh_camera(self.store, id).await?;
         Ok(camera)

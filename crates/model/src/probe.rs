@@ -1,4 +1,4 @@
-//! Loads a model and tests it on a fixed set of boxes before it is used.
+//! Loads a model and tests it on a fixed set of boxes before it is stored.
 //!
 //! Finite parameters do not guarantee finite answers: products overflow, and bounds or offsets may have any
 //! value. Every answer must be finite. At the training boxes the position must be within
@@ -7,7 +7,6 @@
 
 use super::artifact::Artifact;
 use super::regressor::{Regression, Regressor};
-use super::uncertainty::coverage::Coverage;
 use crate::domain::{BoundingBox, Error, Result};
 use crate::geo::EastNorth;
 
@@ -32,12 +31,17 @@ impl Artifact {
     /// Names `metadata.x` or `weights` where something is unknown, missing, of another shape, not
     /// finite, or too large, and the check that the model's answers do not pass.
     pub fn load(&self) -> Result<Regressor> {
-        let parts = self.parts()?;
-        let coverage = Coverage::take(&mut parts.tensors.clone())?;
-        let training_boxes: Vec<BoundingBox> = coverage.boxes().flatten().collect();
-        let regressor = Regressor::build(parts)?;
-        check(&regressor, &training_boxes)?;
+        let regressor = self.restore()?;
+        check(&regressor)?;
         Ok(regressor)
+    }
+
+    /// Loads a model whose answers were checked before: it is what [`Self::load`] has accepted, bit for bit.
+    ///
+    /// # Errors
+    /// Names `metadata.x` or `weights` where something is unknown, missing, of another shape or not finite.
+    pub fn restore(&self) -> Result<Regressor> {
+        Regressor::build(self.parts()?)
     }
 }
 
@@ -45,7 +49,8 @@ impl Artifact {
 ///
 /// # Errors
 /// Names the check that an answer does not pass, and the box.
-fn check(regressor: &Regressor, training_boxes: &[BoundingBox]) -> Result<()> {
+fn check(regressor: &Regressor) -> Result<()> {
+    let training_boxes = &*regressor.training_boxes();
     if training_boxes.is_empty() {
         return Err(failed("coverage.centres hold no box".to_owned()));
     }
@@ -93,10 +98,11 @@ fn limit_boxes() -> impl Iterator<Item = BoundingBox> {
     boxes.filter_map(Result::ok)
 }
 
-/// Every box is tested with and without a fix: the recipe `paper` has a network for either.
+/// Every box is also tested with fixes where the recipe uses them: `paper` has a network for either.
 fn check_box(regressor: &Regressor, bounding_box: &BoundingBox, farthest_m: f64) -> Result<()> {
-    let origin = EastNorth::default();
-    for fix in [None, Some(origin), Some(EastNorth { east_m: 1_000.0, north_m: -1_000.0 })] {
+    let fixes = [EastNorth::default(), EastNorth { east_m: 1_000.0, north_m: -1_000.0 }];
+    let fixes = fixes.into_iter().filter(|_| regressor.encoder.uses_fix());
+    for fix in std::iter::once(None).chain(fixes.map(Some)) {
         let answer = regressor.regress(bounding_box, fix);
         if let Some(fault) = fault_of(regressor, &answer, farthest_m) {
             let [left, top, width, height] = bounding_box.sides_px();

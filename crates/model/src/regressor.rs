@@ -167,6 +167,11 @@ impl Regressor {
         })
     }
 
+    /// Boxes among which every box of the training lies.
+    pub(super) fn training_boxes(&self) -> Vec<BoundingBox> {
+        self.error_model.coverage.boxes().collect()
+    }
+
     /// Size of the image that it was trained on, if known.
     #[must_use]
     pub const fn image_size(&self) -> Option<ImageSize> {

@@ -1,9 +1,6 @@
 //! The area on the ground that a model's training boxes cover.
 
-use super::artifact::Artifact;
-use super::regressor::Regressor;
-use super::uncertainty::coverage::Coverage;
-use crate::domain::{BoundingBox, Result};
+use super::regressor::{Regression, Regressor};
 use crate::geo::{EastNorth, Position};
 use crate::statistics::median;
 
@@ -17,22 +14,17 @@ pub struct ViewArea {
     pub median_r95_m: f64,
 }
 
-impl Artifact {
+impl Regressor {
     /// The area on the ground that the training boxes cover.
-    ///
-    /// # Errors
-    /// Names what is missing or cannot be used, as [`Artifact::load`] does.
-    pub fn view_area(&self, regressor: &Regressor) -> Result<ViewArea> {
-        let coverage = Coverage::take(&mut self.parts()?.tensors)?;
-        let boxes: Vec<BoundingBox> = coverage.boxes().flatten().collect();
-        let answers: Vec<_> =
-            boxes.iter().map(|bounding_box| regressor.regress(bounding_box, None)).collect();
+    #[must_use]
+    pub fn view_area(&self) -> ViewArea {
+        let boxes = self.training_boxes();
+        let answers: Vec<_> = boxes.iter().map(|bounding_box| self.regress(bounding_box, None)).collect();
         let hull = convex_hull(answers.iter().map(|answer| answer.regressed).collect());
-        let radii = answers.iter().map(|answer| answer.r95_scale * answer.e_regression_m2.sqrt());
-        Ok(ViewArea {
-            hull: hull.into_iter().map(|point| regressor.plane().to_position(point)).collect(),
-            median_r95_m: median(radii.collect()),
-        })
+        ViewArea {
+            hull: hull.into_iter().map(|point| self.plane().to_position(point)).collect(),
+            median_r95_m: median(answers.iter().map(Regression::r95_m).collect()),
+        }
     }
 }
 

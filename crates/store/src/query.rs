@@ -69,6 +69,14 @@ impl Dialect {
         }
     }
 
+    /// The texts of the JSON array that is the first parameter, as rows.
+    pub(crate) const fn listed_texts(self) -> &'static str {
+        match self {
+            Self::Sqlite => "SELECT value FROM json_each($1)",
+            Self::Postgres => "SELECT jsonb_array_elements_text($1::JSONB)",
+        }
+    }
+
     /// The bytes of a model's metadata. In a damaged file they may be no text.
     pub(crate) const fn metadata_bytes(self) -> &'static str {
         match self {

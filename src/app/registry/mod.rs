@@ -7,8 +7,8 @@
 mod schedules;
 
 use std::collections::{BTreeSet, HashMap};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
 
 use arc_swap::ArcSwap;
 use jiff::Timestamp;
@@ -25,6 +25,8 @@ use crate::store::{CameraContent, CameraVersion, CameraVersions, ChangeMark, Sto
 
 /// Cameras that a refresh reads at once.
 const READ_AT_ONCE: usize = 256;
+/// Cameras that are worth a thread to load.
+const LEAST_PER_CORE: usize = 32;
 /// Loaded cameras that a refresh shows at once. Every change copies the map, so that few at a time would cost the square
 /// of their number at the start of a server.
 const SHOWN_AT_ONCE: usize = 4_096;
@@ -87,12 +89,24 @@ pub struct ActiveCamera {
 }
 
 /// How well a model does, and where.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug)]
 pub struct ModelSummary {
-    /// The area that its training boxes cover.
-    pub view_area: ViewArea,
     /// Its error on held-out samples, if there were enough.
     pub held_out: Option<HeldOutError>,
+    regressor: Arc<Regressor>,
+    view_area: OnceLock<ViewArea>,
+}
+
+impl ModelSummary {
+    fn new(held_out: Option<HeldOutError>, regressor: Arc<Regressor>) -> Self {
+        Self { held_out, regressor, view_area: OnceLock::new() }
+    }
+
+    /// The area that its training boxes cover; computed when it is asked for, which few cameras of many are.
+    #[must_use]
+    pub fn view_area(&self) -> &ViewArea {
+        self.view_area.get_or_init(|| self.regressor.view_area())
+    }
 }
 
 /// An active model version that cannot be used.
@@ -252,8 +266,11 @@ impl Registry {
         for shown in ids.chunks(SHOWN_AT_ONCE) {
             let mut loaded = Vec::with_capacity(shown.len());
             for group in shown.chunks(READ_AT_ONCE) {
-                for (id, content) in group.iter().zip(store.contents(group).await?) {
-                    match content.and_then(|content| self.load(content, is_distrusted)) {
+                let contents = store.contents(group).await?;
+                let load =
+                    |content: Result<CameraContent>| content.and_then(|it| self.load(it, is_distrusted));
+                for (id, camera) in group.iter().zip(on_all_cores(contents, load)) {
+                    match camera {
                         Ok(camera) => loaded.push((id, Some(camera))),
                         Err(error) => {
                             if error.kind() == ErrorKind::CameraNotFound {
@@ -371,20 +388,23 @@ impl Registry {
         let model = match (camera.active_model.zip(stored), loaded) {
             (None, _) => None,
             (Some((number, _)), Some(loaded)) if loaded.0.1 == number => Some(loaded),
-            (Some((number, stored)), _) => match stored.and_then(|stored| load_model(id, number, stored)) {
-                Ok((regressor, summary)) => {
-                    // The error that the model states must contain the shift that was found.
-                    let regressor = match &moved {
-                        Some(moved) => regressor.with_added_error(moved.change_variance_m2()),
-                        None => regressor,
-                    };
-                    Some(((Arc::new(regressor), number), Arc::new(summary)))
+            (Some((number, stored)), _) => {
+                match stored.read().and_then(|stored| restored(id, number, stored)) {
+                    Ok((regressor, held_out)) => {
+                        let summary = ModelSummary::new(held_out, regressor.clone());
+                        // The error that the model states must contain the shift that was found.
+                        let regressor = match &moved {
+                            Some(moved) => Arc::new(regressor.with_added_error(moved.change_variance_m2())),
+                            None => regressor,
+                        };
+                        Some(((regressor, number), Arc::new(summary)))
+                    }
+                    Err(error) => {
+                        model_fault = Some(self.model_fault(id, number, error)?);
+                        None
+                    }
                 }
-                Err(error) => {
-                    model_fault = Some(self.model_fault(id, number, error)?);
-                    None
-                }
-            },
+            }
         };
         let (model, model_summary) = model.unzip();
         Ok(Arc::new(ActiveCamera {
@@ -434,6 +454,25 @@ impl Registry {
     }
 }
 
+/// The results of work on items, in their order. The calling thread waits meanwhile.
+fn on_all_cores<T: Send, R: Send>(items: Vec<T>, work: impl Fn(T) -> R + Sync) -> Vec<R> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let share = items.len().div_ceil(cores).max(LEAST_PER_CORE);
+    if items.len() <= share {
+        return items.into_iter().map(work).collect();
+    }
+    let mut items = items.into_iter();
+    let shares = std::iter::from_fn(|| Some(items.by_ref().take(share).collect::<Vec<T>>()));
+    let shares: Vec<Vec<T>> = shares.take_while(|share| !share.is_empty()).collect();
+    let work = &work;
+    std::thread::scope(|scope| {
+        let begin = |share: Vec<T>| scope.spawn(move || share.into_iter().map(work).collect::<Vec<R>>());
+        let threads: Vec<_> = shares.into_iter().map(begin).collect();
+        let joined = threads.into_iter().map(|thread| thread.join());
+        joined.flat_map(|results| results.unwrap_or_else(|panic| std::panic::resume_unwind(panic))).collect()
+    })
+}
+
 /// The known cameras that are not among all those stored.
 fn missing(
     known: &HashMap<CameraId, Arc<ActiveCamera>>,
@@ -457,21 +496,19 @@ fn stale(known: &HashMap<CameraId, Arc<ActiveCamera>>, versions: Vec<CameraVersi
     changed.chain(faulty).collect::<BTreeSet<_>>().into_iter().collect()
 }
 
-/// A stored model version, ready to answer.
+/// A stored model version, ready to answer, with its error on held-out samples. Its answers were checked when it was
+/// stored, and when it was activated; to check those of 10,000 models takes a minute.
 ///
 /// # Errors
-/// `ModelUnusable` if what is stored is damaged or does not pass the checks of a model.
-pub(super) fn load_model(
+/// `ModelUnusable` if it cannot be read.
+fn restored(
     id: &CameraId,
     number: u32,
     (metadata, weights): (ModelMetadata, Vec<u8>),
-) -> Result<(Regressor, ModelSummary)> {
+) -> Result<(Arc<Regressor>, Option<HeldOutError>)> {
     let artifact = Artifact { metadata, weights: weights.into() };
-    let loaded = artifact.load().and_then(|regressor| {
-        let view_area = artifact.view_area(&regressor)?;
-        Ok((regressor, ModelSummary { view_area, held_out: artifact.metadata.held_out.clone() }))
-    });
-    loaded.map_err(|error| unusable(id, number, error))
+    let regressor = artifact.restore().map_err(|error| unusable(id, number, error))?;
+    Ok((Arc::new(regressor), artifact.metadata.held_out))
 }
 
 /// The error of a stored version that does not pass the checks of a model.

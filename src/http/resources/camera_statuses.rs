@@ -74,8 +74,8 @@ impl From<&app::ModelSummary> for ModelSummary {
     fn from(summary: &app::ModelSummary) -> Self {
         Self {
             held_out_mean_to_fix_m: summary.held_out.as_ref().map(|held_out| held_out.mean_to_fix_m),
-            median_r95_m: summary.view_area.median_r95_m,
-            view_area: summary.view_area.hull.iter().copied().map(Into::into).collect(),
+            median_r95_m: summary.view_area().median_r95_m,
+            view_area: summary.view_area().hull.iter().copied().map(Into::into).collect(),
         }
     }
 }

@@ -120,12 +120,7 @@ impl Coverage {
 
     /// The boxes at all centres, in their order; `None` where the coordinates are not a valid box.
     pub(crate) fn boxes(&self) -> impl Iterator<Item = Option<BoundingBox>> + '_ {
-        self.centres.iter().map(|centre| {
-            let [foot_x, foot_y, width, height]: [f64; DIMENSIONS] =
-                std::array::from_fn(|axis| f64::from(centre[axis] * self.units[axis]));
-            let (width, height) = (width.exp(), height.exp());
-            BoundingBox::new(foot_x - 0.5 * width, foot_y - height, width, height).ok()
-        })
+        self.centres.iter().map(|centre| box_at(centre, &self.units))
     }
 
     /// Index of the nearest centre.
@@ -294,6 +289,11 @@ impl CoverageTable {
             .filter(|(centre, _)| centre[0] < FAR)
     }
 
+    /// The boxes at all centres that are valid.
+    pub(crate) fn boxes(&self) -> impl Iterator<Item = BoundingBox> + '_ {
+        self.centres().filter_map(|(centre, _)| box_at(&centre, &self.units))
+    }
+
     /// Displacement of the foot point that makes one covering radius, px.
     #[inline]
     pub(crate) fn radius_px(&self) -> f64 {
@@ -310,6 +310,14 @@ fn coordinates(bounding_box: BoundingBox) -> Point {
         (bounding_box.width_px() as f32).ln(),
         (bounding_box.height_px() as f32).ln(),
     ]
+}
+
+/// `None` where the coordinates are not a valid box.
+fn box_at(centre: &Point, units: &Point) -> Option<BoundingBox> {
+    let [foot_x, foot_y, width, height]: [f64; DIMENSIONS] =
+        std::array::from_fn(|axis| f64::from(centre[axis] * units[axis]));
+    let (width, height) = (width.exp(), height.exp());
+    BoundingBox::new(foot_x - 0.5 * width, foot_y - height, width, height).ok()
 }
 
 #[inline]

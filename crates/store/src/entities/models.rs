@@ -16,7 +16,7 @@ use crate::row_decoder::RowDecoder;
 use crate::row_decoder::StoredRow;
 use crate::rows::audit::{Change, version};
 use crate::rows::models::{
-    NewModel, StoredContent, StoredHeldOutError, read_content, read_held_out_error, read_model,
+    NewModel, StoredContent, StoredHeldOutError, StoredModel, read_held_out_error, read_model,
     roll_back_target, select_models as select, write_metadata,
 };
 
@@ -65,7 +65,7 @@ impl Database {
         .bind(number)
         .fetch_optional(&mut reader)
         .await?;
-        read_content(camera, number, content)
+        StoredModel { camera: camera.clone(), number, content }.read()
     }
 
     pub(crate) async fn held_out_errors(

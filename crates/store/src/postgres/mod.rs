@@ -5,7 +5,6 @@
 //! table (`locks`). Locks are taken in this order: cameras by their keys, an idempotency key, jobs, limits. Jobs are claimed with `SKIP LOCKED`.
 
 mod camera_changes;
-mod camera_contents;
 pub(crate) mod connection;
 mod connection_owners;
 mod copy;

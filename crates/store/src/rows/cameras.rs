@@ -6,13 +6,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::domain::{
     Camera, CameraId, CameraKey, CameraMoved, ClockOffset, Error, ErrorKind, ExpectedVersion, GnssBiasSigma,
-    GnssError, ImageSize, ModelMetadata, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision,
-    SampleCount, SigmaM, SiteId, SnapshotSource, TargetClass, TargetId,
+    GnssError, ImageSize, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision, SampleCount, SigmaM,
+    SiteId, SnapshotSource, TargetClass, TargetId,
 };
 use crate::geo::Position;
 use crate::refusals::unknown_site;
 use crate::row_decoder::{RowDecoder, StoredRow};
 use crate::rows::history::StoredHistory;
+use crate::rows::models::StoredModel;
 
 /// Which camera there is, and in which state.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -48,8 +49,8 @@ pub struct CameraContent {
     pub camera: Camera,
     /// The pose change that was detected with its active model.
     pub moved: Option<CameraMoved>,
-    /// Metadata and weights of its active model, or why they cannot be used.
-    pub model: Option<Result<(ModelMetadata, Vec<u8>)>>,
+    /// Its active model, which is yet to be read.
+    pub model: Option<StoredModel>,
 }
 
 /// Columns: id, key, revision, active model.

@@ -123,19 +123,28 @@ pub(crate) fn write_metadata(metadata: &ModelMetadata) -> Result<String> {
 /// Metadata document, weights and checksum of a version, if it was found.
 pub(crate) type StoredContent = Option<(Vec<u8>, Vec<u8>, String)>;
 
-/// Metadata and weights of a version as they were stored, with the checksum verified.
-pub(crate) fn read_content(
-    camera: &CameraId,
-    number: u32,
-    content: StoredContent,
-) -> Result<(ModelMetadata, Vec<u8>)> {
-    let (document, weights, sha256) = content.ok_or_else(|| no_model(camera, number))?;
-    if sha256 != model_sha256(&document, &weights) {
-        return Err(unusable(camera, number, "what is stored does not match its checksum"));
+/// A version as it is stored.
+pub struct StoredModel {
+    pub(crate) camera: CameraId,
+    pub(crate) number: u32,
+    pub(crate) content: StoredContent,
+}
+
+impl StoredModel {
+    /// Metadata and weights, with the checksum verified.
+    ///
+    /// # Errors
+    /// [`ErrorKind::ModelNotFound`]; [`ErrorKind::ModelUnusable`] for what is damaged.
+    pub fn read(self) -> Result<(ModelMetadata, Vec<u8>)> {
+        let Self { camera, number, content } = self;
+        let (document, weights, sha256) = content.ok_or_else(|| no_model(&camera, number))?;
+        if sha256 != model_sha256(&document, &weights) {
+            return Err(unusable(&camera, number, "what is stored does not match its checksum"));
+        }
+        let metadata = serde_json::from_slice(&document)
+            .map_err(|error| unusable(&camera, number, &format!("its metadata cannot be read: {error}")))?;
+        Ok((metadata, weights))
     }
-    let metadata = serde_json::from_slice(&document)
-        .map_err(|error| unusable(camera, number, &format!("its metadata cannot be read: {error}")))?;
-    Ok((metadata, weights))
 }
 
 /// Finds the position to be rolled back and the version that becomes active, in the latest two activations that were

@@ -226,7 +226,7 @@ async fn contents_of_cameras_come_in_the_order_asked_for() {
     let square = next().expect("known");
     assert_eq!(square.camera, store.camera(&camera).await.expect("known"));
     assert_eq!(square.moved, None);
-    assert_eq!(square.model.expect("active").expect("sound"), (metadata(), b"two".to_vec()));
+    assert_eq!(square.model.expect("active").read().expect("sound"), (metadata(), b"two".to_vec()));
     assert_eq!(next().err().expect("unknown").kind(), ErrorKind::CameraNotFound);
     let a = next().expect("known");
     assert_eq!(a.camera.profile, full("a"));

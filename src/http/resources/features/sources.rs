@@ -188,7 +188,7 @@ async fn tracks(
 
 fn camera_feature(status: CameraStatus) -> Result<Feature> {
     let CameraStatus { camera, model_summary, activity, .. } = status;
-    let hull = model_summary.as_ref().map(|summary| summary.view_area.hull.clone());
+    let hull = model_summary.as_ref().map(|summary| summary.view_area().hull.clone());
     let geometry = match hull {
         Some(hull) if hull.len() >= 3 => Geometry::Polygon(hull),
         Some(hull) => hull.first().copied().map_or(Geometry::Unknown, Geometry::Point),
@@ -199,7 +199,7 @@ fn camera_feature(status: CameraStatus) -> Result<Feature> {
         "display_name": camera.profile.display_name,
         "site": camera.profile.site.as_ref().map(|site| site.as_str()),
         "active_model": camera.active_model,
-        "median_r95_m": model_summary.as_ref().map(|summary| summary.view_area.median_r95_m),
+        "median_r95_m": model_summary.as_ref().map(|summary| summary.view_area().median_r95_m),
         "targets": activity.targets,
         "last_observed_at": activity.last_observed_at,
         "created_at": camera.created_at,

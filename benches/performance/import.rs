@@ -104,8 +104,8 @@ impl Peer {
         let mut connection = self.connection.borrow_mut();
         let camera: i64 = connection
             .query_row(
-                "INSERT INTO cameras (id, display_name, recipe, target_classes, labels, revision, \
-                 created_at_us, updated_at_us) VALUES (?, 'peer', 'hybrid', '[]', '{}', 1, 0, 0) RETURNING key",
+                "INSERT INTO cameras (id, profile, learn_automatically, revision, created_at_us, updated_at_us) \
+                 VALUES (?, '{}', 0, 1, 0, 0) RETURNING key",
                 [format!("peer-{round}")],
                 |row| row.get(0),
             )

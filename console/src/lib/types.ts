@@ -328,7 +328,6 @@ export interface EvaluatedPosition extends Position {
 export interface EvaluationReport {
   methods: Record<string, ErrorFigures>;
   failed?: Record<string, string>;
-  /** Missing in evaluations of earlier releases. */
   positions?: Record<string, EvaluatedPosition[]>;
 }
 export interface ServerInfo {

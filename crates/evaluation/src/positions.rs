@@ -41,7 +41,7 @@ pub struct ReportWithPositions {
     #[serde(flatten)]
     pub report: Report,
     /// Positions by the method's name: those of at most 500 test samples, the same for every method, in order of
-    /// target, then time. Evaluations of earlier releases have none.
+    /// target, then time.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub positions: BTreeMap<String, Vec<EvaluatedPosition>>,
 }

@@ -269,7 +269,7 @@ pub struct ModelMetadata {
     pub held_out: Option<HeldOutError>,
     /// The candidates of the model selection.
     pub candidates: Vec<CandidateReport>,
-    /// The run's findings; `None` for models of earlier releases.
+    /// The run's findings.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub report: Option<TrainingReport>,
     /// The run that trained it together with the other cameras of its site, if one did.

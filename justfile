@@ -22,6 +22,7 @@ console:
 interfaces:
     cargo run -- openapi > docs/openapi.json
     cd clients/python && python -m codegen.proto_reference
+    UPDATE_REFERENCE=1 cargo test --test it reference
 
 # The pages of docs/ as a site in target/site.
 docs:

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 use super::origin::tile_origin;
 
@@ -15,17 +16,19 @@ const PMTILES_MAGIC: &[u8; 8] = b"PMTiles\x03";
 const OPENSTREETMAP: &str = "https://tile.openstreetmap.org/{z}/{x}/{y}.png";
 
 /// The settings of the operator's console.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Console {
     /// Map tiles under the cameras, with `{z}`, `{x}` and `{y}`; without it the map is a plain plane and the
     /// console asks no other server.
     pub tile_url: Option<String>,
     /// A PMTiles file of map tiles that the server itself offers; instead of `tile_url`.
+    #[schema(value_type = Option<String>)]
     pub tile_file: Option<PathBuf>,
     /// The attribution that the provider of the tiles asks for on the map.
     pub tile_attribution: Option<String>,
     /// File with the authority (PEM) of the server's own certificate. Phones fetch it from `/authority.crt` to trust it.
+    #[schema(value_type = Option<String>)]
     pub authority: Option<PathBuf>,
     /// True if the page offers the map of OpenStreetMap, whose server browsers ask once their user has agreed. Only
     /// without tiles of these settings.

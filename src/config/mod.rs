@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 use crate::domain::{Error, ErrorKind, Result, SampleOverflow, TimeBounds};
 
@@ -23,13 +24,15 @@ pub use secret::{DeclaredConnection, Secret};
 pub use tls::TlsSettings;
 
 /// Everything that can be set.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
     /// Folder of the database, created at the first start.
+    #[schema(value_type = String)]
     pub data: PathBuf,
     /// URL of a PostgreSQL database that replaces the folder, such as
     /// `postgres://user:password@host/sightfix?sslmode=verify-full`; none by default.
+    #[schema(value_type = Option<String>)]
     pub database: Option<Secret>,
     /// The role of this process among those that share one database.
     pub role: NodeRole,
@@ -41,8 +44,10 @@ pub struct Config {
     /// Seconds after which the live streams of a silent process go to another one with the same database.
     pub node_lease_s: u32,
     /// Address of the one port for REST and gRPC.
+    #[schema(value_type = String)]
     pub listen: SocketAddr,
     /// Address of a second port, for probes and metrics alone, without keys and without TLS; none if left out.
+    #[schema(value_type = Option<String>)]
     pub metrics_listen: Option<SocketAddr>,
     /// Host names under which clients reach the server besides its addresses, each with or without a
     /// port; `*` accepts every name.
@@ -55,14 +60,17 @@ pub struct Config {
     /// Serve everybody on an address that other machines reach, while no key exists.
     pub insecure: bool,
     /// Secret of an administrator's key (`sightfix keys generate`), for the first start of a container.
+    #[schema(value_type = Option<String>)]
     pub admin_key: Option<Secret>,
     /// File that contains that secret instead.
+    #[schema(value_type = Option<String>)]
     pub admin_key_file: Option<PathBuf>,
     /// Encryption of the port.
     pub tls: TlsSettings,
     /// Sign-in of people by OpenID Connect.
     pub openid: OpenIdSettings,
     /// Secret of the key that `replay` sends to a server.
+    #[schema(value_type = Option<String>)]
     pub api_key: Option<Secret>,
     /// `text` or `json` lines in the log.
     pub log_format: LogFormat,
@@ -77,13 +85,16 @@ pub struct Config {
     pub evaluation: Workers,
     /// Folder below which sinks of connections write files (`file:`), each in a folder of its own; without it there are
     /// no such sinks.
+    #[schema(value_type = Option<String>)]
     pub export_folder: Option<PathBuf>,
     /// Where finished tracks of cameras and sites with a history are kept: a folder, or a bucket of an object store as
     /// `s3://bucket/prefix` (docs/howto/history.md); by default the folder `archive` in `data`.
     pub archive: Option<String>,
     /// Serial devices that sources of connections may read (`serial:`), as their addresses name them.
+    #[schema(value_type = Vec<String>)]
     pub serial_devices: Vec<PathBuf>,
     /// Connections with other systems, as `POST /v1/connections` takes them; created or changed at the start.
+    #[schema(value_type = Vec<String>)]
     pub connections: Vec<DeclaredConnection>,
     /// The operator's console.
     pub console: Console,
@@ -92,7 +103,7 @@ pub struct Config {
 }
 
 /// The response to a request for the live state of a camera that another process has.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum OtherNode {
     /// The client gets the address of the other process: 307, or `UNAVAILABLE` with `owner` in `ErrorInfo`.
@@ -102,7 +113,7 @@ pub enum OtherNode {
 }
 
 /// The role of a process among those that share one database.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum NodeRole {
     /// Answers clients, and works on training runs and evaluations.
@@ -138,7 +149,7 @@ impl NodeRole {
 }
 
 /// Form of the log lines.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum LogFormat {
     /// Lines for people.
@@ -148,7 +159,7 @@ pub enum LogFormat {
 }
 
 /// Workers of one kind of background job.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Workers {
     /// Jobs carried out at the same time, each on a thread of its own at the lowest priority.
@@ -158,7 +169,7 @@ pub struct Workers {
 }
 
 /// Everything that an outside client can make large has its limit here.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Limits {
     /// Bytes of a request body, other than an import.
@@ -341,6 +352,7 @@ pub struct Limits {
     /// Days that samples are kept, by their times; 0 is without end.
     pub sample_days: u32,
     /// The rule beyond `samples_per_camera`: `refuse`, or `delete_oldest`.
+    #[schema(value_type = String)]
     pub sample_overflow: SampleOverflow,
     /// Samples of all cameras; more are refused.
     pub samples: u64,

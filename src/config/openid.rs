@@ -4,12 +4,13 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 use super::origin::url_origin;
 use super::secret::Secret;
 
 /// Sign-in of people by OpenID Connect; there is none without `issuer`.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct OpenIdSettings {
     /// Identifier of the provider, such as `https://login.example.org/realms/site`: where its discovery document is.
@@ -17,8 +18,10 @@ pub struct OpenIdSettings {
     /// As the provider knows this server.
     pub client_id: Option<String>,
     /// Secret of the client; left out for a public client.
+    #[schema(value_type = Option<String>)]
     pub client_secret: Option<Secret>,
     /// File that contains that secret instead.
+    #[schema(value_type = Option<String>)]
     pub client_secret_file: Option<PathBuf>,
     /// `https://HOST/v1/session/openid/callback`, as it is registered at the provider.
     pub redirect_url: Option<String>,
@@ -34,6 +37,7 @@ pub struct OpenIdSettings {
     /// Values that make a viewer; `*` is everybody who signs in.
     pub viewers: Vec<String>,
     /// File with the authority of the provider's certificate (PEM), instead of the system's authorities.
+    #[schema(value_type = Option<String>)]
     pub ca: Option<PathBuf>,
 }
 

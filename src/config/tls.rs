@@ -4,18 +4,22 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 use crate::domain::{CameraId, Role, Scope};
 
 /// Encryption of the port.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize, ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct TlsSettings {
     /// File with the server's certificate chain (PEM); plain HTTP without.
+    #[schema(value_type = Option<String>)]
     pub certificate: Option<PathBuf>,
     /// File with its private key (PEM).
+    #[schema(value_type = Option<String>)]
     pub key: Option<PathBuf>,
     /// File with the authority of client certificates (PEM); none are asked for without.
+    #[schema(value_type = Option<String>)]
     pub client_ca: Option<PathBuf>,
     /// The role of holders of client certificates: `viewer` if left out, `edge`, `operator`, `admin`.
     pub client_role: Option<String>,

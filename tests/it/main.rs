@@ -49,6 +49,7 @@ mod places;
 mod postgres;
 mod power_cut;
 mod promotion;
+mod reference;
 mod refused_clients;
 mod repeated_requests;
 mod replay;

@@ -2,8 +2,8 @@
 
 benches/page.py RUN.json
 
-Each table goes below the heading with its title, in place of the table that is there; the machine goes below the line
-that begins with "Machine:". Fails if the page lacks a heading, or the run a table of the page.
+Each table replaces the one below the heading with its title, and the machine the line that begins with "Machine:".
+Fails if the page has no place for a table.
 """
 
 import argparse
@@ -26,22 +26,24 @@ def shown(number: float) -> str:
 
 
 def markdown(table: dict[str, Any]) -> str:
+    """The table as Markdown."""
     lines = ["| " + " | ".join(table["columns"]) + " |", "|---|" + "---:|" * (len(table["columns"]) - 1)]
     lines += [f"| {row['name']} | {' | '.join(map(shown, row['numbers']))} |" for row in table["rows"]]
     return "\n".join(lines) + "\n"
 
 
 def main() -> int:
+    """Writes the page; 1 if it has no place for a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     run = json.loads(parser.parse_args().run.read_text("utf-8"))
     page, missing = PAGE.read_text("utf-8"), []
     for table in run["tables"]:
-        pattern = TABLE.format(re.escape(table["title"]))
-        head = f"### {table['title']}\n\n"
-        page, found = re.subn(pattern, lambda old, head=head, new=markdown(table): head + old[1] + new, page)
-        if found != 1:
+        places = list(re.finditer(TABLE.format(re.escape(table["title"])), page))
+        if len(places) != 1:
             missing.append(table["title"])
+            continue
+        page = page[: places[0].start(2)] + markdown(table) + page[places[0].end(2) :]
     machine = f"Machine: {run['processor']}, {run['cores']} cores; version {run['version']}."
     page, found = re.subn(r"(?m)^Machine: .*$", machine, page)
     if found != 1:

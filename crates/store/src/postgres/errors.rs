@@ -2,6 +2,9 @@
 
 use std::time::Duration;
 
+use sqlx::error::DatabaseError;
+use sqlx::postgres::{PgDatabaseError, PgSeverity};
+
 use crate::domain::{Error, ErrorKind, Refusal};
 use crate::refusals::closed;
 
@@ -9,6 +12,10 @@ use crate::refusals::closed;
 const ATTEMPTS: u32 = 5;
 /// Before the second attempt; before each further one so much more.
 const PAUSE: Duration = Duration::from_millis(10);
+
+/// SQLSTATE of an error that has no code of its own.
+const INTERNAL_ERROR: &str = "XX000";
+const ENDED: &str = "the database has ended the connection; try again";
 
 /// The meaning of a failed statement for its caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -31,9 +38,7 @@ fn meaning_of_code(code: &str) -> Meaning {
         "25006" => {
             Meaning::TryAgain("the database takes no changes now: it is a standby, or read-only; try again")
         }
-        "25P03" | "57P01" | "57P02" | "57P03" | "57P05" => {
-            Meaning::TryAgain("the database has ended the connection; try again")
-        }
+        "25P03" | "57P01" | "57P02" | "57P03" | "57P05" => Meaning::TryAgain(ENDED),
         code if code.starts_with("08") || code.starts_with("53") => {
             Meaning::TryAgain("the database takes no more connections or has no resources left; try again")
         }
@@ -50,9 +55,20 @@ pub(super) fn meaning(error: &sqlx::Error) -> Meaning {
         sqlx::Error::Io(_) | sqlx::Error::Tls(_) | sqlx::Error::Protocol(_) | sqlx::Error::BeginFailed => {
             Meaning::TryAgain("the database cannot be reached; try again")
         }
-        sqlx::Error::Database(error) => error.code().map_or(Meaning::Fault, |code| meaning_of_code(&code)),
+        sqlx::Error::Database(error) => match error.code().as_deref() {
+            // As when a new connection's cache of the catalogue finds no room on the disk.
+            Some(INTERNAL_ERROR) if is_fatal(&**error) => Meaning::TryAgain(ENDED),
+            Some(code) => meaning_of_code(code),
+            None => Meaning::Fault,
+        },
         _ => Meaning::Fault,
     }
+}
+
+/// True if the error has ended the connection.
+fn is_fatal(error: &dyn DatabaseError) -> bool {
+    let error = error.try_downcast_ref::<PgDatabaseError>();
+    error.is_some_and(|error| matches!(error.severity(), PgSeverity::Fatal | PgSeverity::Panic))
 }
 
 /// A failed statement: refused where the caller can do something about it, else a fault. Why a change was refused

@@ -59,8 +59,7 @@ pub use postgres::{Acquired, ConnectionReports, HistoryMark, NodeLeases, Renewed
 pub use rows::cameras::{CameraContent, CameraVersion, CameraVersions, ChangeMark};
 pub use rows::idempotency::{IdempotencyRecord, StoredAnswer};
 pub use rows::keys::KeysVersion;
-pub use rows::models::StoredModel;
-pub use rows::models::{NewModel, StoredHeldOutError};
+pub use rows::models::{NewModel, StoredHeldOutError, StoredModel};
 pub use rows::runs::{RunEnd, RunOutput};
 pub use rows::site_runs::{SiteCameraOutput, SiteRunEnd, SiteRunOutput};
 pub use sqlite::{

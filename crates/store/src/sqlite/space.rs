@@ -112,9 +112,9 @@ impl Store {
         let was_scarce = reserve.is_disk_scarce().await?;
         if was_scarce {
             reserve.release().await?;
-            // A log that has been copied back is written from its start again. If the space is not enough
-            // for that, it may be for the deletion.
-            if let Err(error) = writer.execute("PRAGMA wal_checkpoint(PASSIVE)").await {
+            // The log is copied back, and its space is free for the deletion when those who still read from it have
+            // ended. If the space is not enough for the copy, it may be for the deletion.
+            if let Err(error) = writer.execute("PRAGMA wal_checkpoint(TRUNCATE)").await {
                 tracing::debug!(%error, "the log stays as it is");
             }
         }
@@ -130,7 +130,7 @@ impl Store {
     pub(crate) async fn maintain(&self) -> Result<StorageStatus> {
         let space = &self.inner.space;
         self.log_newcomers();
-        let is_reserved = space.reserve.ensure().await?;
+        let is_reserved = self.set_space_aside().await?;
         self.vacuum().await?;
         self.count_all_samples().await?;
         let (pages, free_pages) = self.pages().await?;
@@ -149,6 +149,12 @@ impl Store {
             queued_rows: self.inner.samples.queued_rows(),
             is_full: self.is_full(),
         })
+    }
+
+    /// Sets space aside while nobody writes: a deletion on a full disk needs what it has released until it ends.
+    async fn set_space_aside(&self) -> Result<bool> {
+        let _writer = self.changing(Durability::Relaxed).await?;
+        self.inner.space.reserve.ensure().await
     }
 
     /// Gives some of the free pages back, few enough that nobody waits for long.

@@ -1,7 +1,12 @@
-use super::{file_store, in_folder};
+use std::time::Duration;
+
+use tempfile::TempDir;
+
+use super::{FileStore, file_store, in_folder};
 use crate::domain::{Durability, ErrorKind, NewCamera, Sample};
 use crate::tests::group::{call, count, hold, release};
 use crate::tests::{Fixture, at, kind, sample};
+use crate::{Sharing, StoreLimits, StoreOptions};
 
 #[tokio::test]
 async fn a_dropped_transaction_is_rolled_back_and_releases_the_writer() {
@@ -78,4 +83,28 @@ async fn a_full_disk_is_reported_and_the_transaction_rolled_back() {
         store.insert_samples(camera, vec![sample(1, "a")], Durability::Synced).await.expect("fits").accepted,
         1
     );
+}
+
+#[tokio::test]
+async fn maintenance_leaves_a_deletion_on_a_full_disk_the_space_that_was_released_for_it() {
+    let folder = TempDir::new().expect("a folder");
+    let reserve = folder.path().join("sightfix.reserve");
+    std::fs::write(&reserve, vec![0; 1 << 20]).expect("set aside by an earlier start");
+    let limits = StoreLimits { reserve_bytes: u64::MAX / 2, ..StoreLimits::default() };
+    let options = StoreOptions { limits, sharing: Sharing::OneServer, ..StoreOptions::default() };
+    let store = FileStore::open_with(folder.path(), options).await.expect("opens");
+    let is_reserved = || reserve.exists();
+    assert!(is_reserved());
+
+    let deletion = store.deletion().await.expect("the writer");
+    assert!(!is_reserved());
+    let maintenance = tokio::spawn({
+        let store = store.clone();
+        async move { store.maintain().await }
+    });
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    assert!(!is_reserved(), "the deletion has not ended");
+    deletion.reclaim().await;
+    maintenance.await.expect("no panic").expect("maintained");
+    assert!(is_reserved());
 }

@@ -112,14 +112,14 @@ def _unknown_version(_plant: Plant, request: Request, forward: Forward) -> Answe
     return answer.with_json({"items": [{"model_version": 99}]}) if answer.status == 200 else answer
 
 
-def _begin_again(_plant: Plant, request: Request, forward: Forward) -> Answer:
-    """Says that a run that has ended is running."""
+def _fail_in_between(_plant: Plant, request: Request, forward: Forward) -> Answer:
+    """Says that a run has failed which goes on or has succeeded."""
     answer = forward(request)
     if answer.status != 200:
         return answer
     page = answer.json
     for run in page["items"][-1:]:
-        run["state"] = "running"
+        run["state"] = "failed"
     return answer.with_json(page)
 
 
@@ -187,7 +187,7 @@ def plants() -> list[Plant]:
         Plant(
             "revived-key", "keys_work_from_creation_to_revocation", "GET", "^/v1/session$", clients, _take_any_key, 1
         ),
-        Plant("begun-again", "runs_end_once", "GET", runs, clients, _begin_again),
+        Plant("ended-twice", "runs_end_once", "GET", runs, clients, _fail_in_between),
         Plant("stolen-run", "live_runs_are_not_taken_over", "GET", runs, clients, _claim_again),
         Plant("hidden-change", "the_audit_log_has_exactly_the_changes", "GET", audit, clients, _drop_an_entry, 1),
         Plant("lost-event", "events_are_complete_or_marked_lost", STREAM, "/events$", clients, _pass_on),

@@ -93,8 +93,8 @@ impl MatchingReport {
     #[must_use]
     pub fn table(&self) -> String {
         let mut table = String::from(
-            "| model known | pairs from 0.9 on: right | stated | share of all pairs found | share of their boxes | stated: right (pairs) |\n\
-             |---|---|---|---|---|---|\n",
+            "| model known | pairs from 0.9 on: right | wrong ones: companions | stated | share of all pairs found | share of their boxes | groups that have the carrier | stated: right (pairs) |\n\
+             |---|---|---|---|---|---|---|---|\n",
         );
         for case in &self.cases {
             let MatchingCase { name, known, .. } = case;
@@ -109,12 +109,16 @@ impl MatchingReport {
             // Writing to a string cannot fail.
             let _ = writeln!(
                 table,
-                "| {name} | {:.3} of {} | {:.3} | {:.3} | {:.3} | {} |",
+                "| {name} | {:.3} of {} | {} of {} | {:.3} | {:.3} | {:.3} | {:.3} of {} | {} |",
                 share(sure.right, sure.pairs),
                 sure.pairs,
+                known.companions,
+                sure.pairs - sure.right,
                 sure.stated / sure.pairs.max(1) as f64,
                 share(known.found, known.true_pairs),
                 share(known.found_boxes, known.true_boxes),
+                share(known.groups.right, known.groups.pairs),
+                known.groups.pairs,
                 bins.join(", "),
             );
         }
@@ -126,15 +130,15 @@ impl MatchingReport {
 
     fn write_search(&self, table: &mut String) {
         table.push_str(
-            "\n| nothing known | accepted | within 1.2 times | beyond twice | error m | with identities m | sure pairs right | shifted, accepted |\n\
-             |---|---|---|---|---|---|---|---|\n",
+            "\n| nothing known | accepted | within 1.2 times | beyond twice | error m | with identities m | sure pairs right | wrong ones: companions | shifted, accepted |\n\
+             |---|---|---|---|---|---|---|---|---|\n",
         );
         for MatchingCase { name, unknown, .. } in &self.cases {
             let sure = unknown.pairs.sure();
             let mean = |sum: f64| sum / unknown.accepted.max(1) as f64;
             let _ = writeln!(
                 table,
-                "| {name} | {} of {} | {} | {} | {:.2} | {:.2} | {} of {} | {} |",
+                "| {name} | {} of {} | {} | {} | {:.2} | {:.2} | {} of {} | {} of {} | {} |",
                 unknown.accepted,
                 unknown.cases,
                 unknown.within_1_2,
@@ -143,6 +147,8 @@ impl MatchingReport {
                 mean(unknown.known_error_sum_m),
                 sure.right,
                 sure.pairs,
+                unknown.pairs.companions,
+                sure.pairs - sure.right,
                 unknown.shifted_accepted,
             );
         }

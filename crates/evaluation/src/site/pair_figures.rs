@@ -13,6 +13,8 @@ use crate::fusion::association::{MatchedPiece, Matching};
 const SURE: f64 = 0.9;
 /// Lower bounds of the bins of stated probabilities, after that from 0 on.
 const BINS: [f64; 5] = [0.3, 0.5, 0.7, 0.9, 0.95];
+/// A target within this distance of the carrier for most of a piece's boxes is its companion, m.
+const COMPANION_WITHIN_M: f64 = 1.5;
 /// Fixes during a tracklet that make a true pair.
 const LEAST_FIXES: usize = 3;
 
@@ -25,6 +27,16 @@ pub struct Bin {
     pub right: usize,
     /// Sum of the stated probabilities.
     pub stated: f64,
+}
+
+impl Bin {
+    fn plus(&self, other: &Self) -> Self {
+        Self {
+            pairs: self.pairs + other.pairs,
+            right: self.right + other.right,
+            stated: self.stated + other.stated,
+        }
+    }
 }
 
 /// Counts of pairs, and of the boxes of pairs.
@@ -40,6 +52,10 @@ pub struct PairFigures {
     pub true_boxes: usize,
     /// See `true_boxes`.
     pub found_boxes: usize,
+    /// Wrong pairs of a probability of 0.9 or more whose target walks with the carrier.
+    pub companions: usize,
+    /// Groups that share a receiver; right if one of the members is the carrier.
+    pub groups: Bin,
 }
 
 impl PairFigures {
@@ -61,12 +77,26 @@ impl PairFigures {
             bin.pairs += 1;
             bin.right += usize::from(is_right);
             bin.stated += piece.probability;
-            if is_right && piece.probability >= SURE {
+            if piece.probability < SURE {
+                continue;
+            }
+            if is_right {
                 figures.found_boxes += piece.detections.len();
                 found.extend(receiver.map(|receiver| (&piece.tracker_id, receiver)));
+            } else if carrier.is_some_and(|carrier| shows_companion(recording, boxes, piece, carrier)) {
+                figures.companions += 1;
             }
         }
         figures.found = found.intersection(&truth).count();
+        for group in &matching.groups {
+            let carrier = recording.receivers.iter().find(|(id, _)| id == group.receiver_id());
+            let is_carrier = |member: &MatchedPiece| {
+                carrier.is_some_and(|(_, carrier)| target_of(boxes, member) == Some(*carrier))
+            };
+            figures.groups.pairs += 1;
+            figures.groups.right += usize::from(group.members.iter().any(is_carrier));
+            figures.groups.stated += group.probability();
+        }
         figures
     }
 
@@ -74,25 +104,21 @@ impl PairFigures {
     #[must_use]
     pub fn plus(mut self, other: &Self) -> Self {
         for (own, other) in self.bins.iter_mut().zip(&other.bins) {
-            own.pairs += other.pairs;
-            own.right += other.right;
-            own.stated += other.stated;
+            *own = own.plus(other);
         }
+        self.groups = self.groups.plus(&other.groups);
         self.true_pairs += other.true_pairs;
         self.found += other.found;
         self.true_boxes += other.true_boxes;
         self.found_boxes += other.found_boxes;
+        self.companions += other.companions;
         self
     }
 
     /// The pairs from a probability of 0.9 on.
     #[must_use]
     pub fn sure(&self) -> Bin {
-        self.bins[4..].iter().fold(Bin::default(), |sum, bin| Bin {
-            pairs: sum.pairs + bin.pairs,
-            right: sum.right + bin.right,
-            stated: sum.stated + bin.stated,
-        })
+        self.bins[4..].iter().fold(Bin::default(), |sum, bin| sum.plus(bin))
     }
 }
 
@@ -101,6 +127,23 @@ fn target_of(boxes: &[LabelledBox], piece: &MatchedPiece) -> Option<usize> {
     let mut counts: BTreeMap<Option<usize>, usize> = BTreeMap::new();
     piece.detections.iter().for_each(|at| *counts.entry(boxes[*at].target).or_default() += 1);
     counts.into_iter().max_by_key(|(_, count)| *count)?.0
+}
+
+/// True if most boxes of a piece show a target near the carrier.
+fn shows_companion(
+    recording: &SiteRecording,
+    boxes: &[LabelledBox],
+    piece: &MatchedPiece,
+    carrier: usize,
+) -> bool {
+    let is_near = |own: &LabelledBox| {
+        let position = |target| recording.truth.get(&(own.time, target));
+        let own_position = own.target.and_then(position);
+        own_position
+            .zip(position(carrier))
+            .is_some_and(|(own, carrier)| own.distance_m(*carrier) <= COMPANION_WITHIN_M)
+    };
+    2 * piece.detections.iter().filter(|at| is_near(&boxes[**at])).count() > piece.detections.len()
 }
 
 /// Ids of trackers with the receivers of their targets that have enough fixes between the first and the last box.

@@ -8,8 +8,10 @@ use super::assignment::posterior;
 use super::cancellation::Cancellation;
 use super::chains::{Chain, ChainSettings, Piece, PieceTable};
 use super::companions::View;
+use super::company::Company;
 use super::cuts;
 use super::evidence::EvidenceModel;
+use super::groups::{Candidate, MatchedGroup, groups};
 use super::recording::Scene;
 use super::tracklet::{SceneMotion, TimedFix, Tracklet};
 use crate::domain::{
@@ -102,6 +104,8 @@ pub struct MatchedPiece {
 pub struct Matching {
     /// Pieces of tracklets with their most probable receivers, in order of tracker's id and time.
     pub pieces: Vec<MatchedPiece>,
+    /// Tracklets that share a receiver, none of them sure, in order of receiver and time.
+    pub groups: Vec<MatchedGroup>,
     /// Clock offsets found, beside those that were given.
     pub clock_offsets: Vec<(ReceiverId, ClockOffset)>,
     /// Tracklets and receivers that were compared.
@@ -225,31 +229,109 @@ pub(super) fn match_located(
     let offsets_s = clock_offsets_s(located, &model, settings, cancellation)?;
     let timed: Vec<(&[TimedFix], f64)> =
         located.fixes.iter().map(Vec::as_slice).zip(offsets_s.iter().copied()).collect();
-    let owned = owned_pieces(located.tracklets, &timed, &model, &settings.chains, random, cancellation)?;
+    let posterior =
+        piece_posterior(located.tracklets, &timed, &model, &settings.chains, random, cancellation)?;
+    let view = View::of(scene.detections);
+    let own_probability = |piece: &Piece| {
+        let Piece { tracklet, first, end } = *piece;
+        view.own_probability(scene.detections, &located.detections[tracklet][first..end])
+    };
+    let shown = ShownPieces {
+        scene,
+        located,
+        own_probabilities: posterior.pieces.iter().map(own_probability).collect(),
+        posterior,
+    };
     let mut matching = Matching {
+        pieces: shown.matched(),
+        groups: shown.groups(settings.min_probability),
         tracklets: located.tracklets.len(),
         receivers: scene.receiver_ids.len(),
-        cuts: owned.len().saturating_sub(located.tracklets.len()),
+        cuts: shown.posterior.pieces.len().saturating_sub(located.tracklets.len()),
         ..Matching::default()
     };
-    let view = View::of(scene.detections);
-    for OwnedPiece { piece: Piece { tracklet, first, end }, receiver, probability } in owned {
-        let detections = &located.detections[tracklet][first..end];
-        let probability = probability * view.own_probability(scene.detections, detections);
-        if probability >= LEAST_PROBABILITY {
-            matching.pieces.push(MatchedPiece {
-                tracker_id: scene.tracklets[tracklet].tracker_id.clone(),
-                detections: detections.to_vec(),
-                receiver_id: scene.receiver_ids[receiver].clone(),
-                probability,
-            });
-        }
-    }
     let found = scene.receiver_ids.iter().zip(offsets_s).filter(|(_, offset_s)| *offset_s != 0.0);
     matching.clock_offsets = found
         .filter_map(|(id, offset_s)| Some((id.clone(), ClockOffset::from_seconds(offset_s).ok()?)))
         .collect();
     Ok(matching)
+}
+
+/// Pieces with their posterior probabilities, and what their targets' unseen companions leave of these.
+struct ShownPieces<'a> {
+    scene: &'a Scene<'a>,
+    located: &'a Located<'a>,
+    posterior: PiecePosterior,
+    /// By piece, the probability that its target, rather than an unseen companion, is the one whose place it shows.
+    own_probabilities: Vec<f64>,
+}
+
+impl ShownPieces<'_> {
+    /// Each piece with its most probable receiver.
+    fn matched(&self) -> Vec<MatchedPiece> {
+        let owned = self.posterior.owned().zip(&self.own_probabilities);
+        let matched = owned.map(|(own, factor)| {
+            let Piece { tracklet, first, end } = own.piece;
+            let detections = &self.located.detections[tracklet][first..end];
+            self.piece(own.piece, detections, own.receiver, factor * own.probability)
+        });
+        matched.filter(|own| own.probability >= LEAST_PROBABILITY).collect()
+    }
+
+    /// The pieces that share a receiver.
+    fn groups(&self, min_probability: f64) -> Vec<MatchedGroup> {
+        let of_receiver = |(receiver, probabilities): (usize, &Vec<f64>)| {
+            let shares = probabilities.iter().zip(&self.own_probabilities).map(|(own, factor)| own * factor);
+            let known = self.posterior.pieces.iter().zip(shares);
+            let known: Vec<(Piece, f64)> = known
+                .filter(|(_, own)| *own >= LEAST_PROBABILITY)
+                .map(|(piece, own)| (*piece, own))
+                .collect();
+            let candidate = |(piece, probability): &(Piece, f64)| {
+                let points = &self.located.tracklets[piece.tracklet].points[piece.first..piece.end];
+                Some(Candidate {
+                    span_s: [points.first()?.time_s, points.last()?.time_s],
+                    probability: *probability,
+                })
+            };
+            let candidates: Vec<Candidate> = known.iter().filter_map(candidate).collect();
+            let found = groups(&candidates, min_probability).into_iter();
+            let group = |(members, span_s): (Vec<usize>, [f64; 2])| MatchedGroup {
+                members: members.iter().map(|at| self.during(known[*at], receiver, span_s)).collect(),
+            };
+            found.map(group).collect::<Vec<_>>()
+        };
+        self.posterior.probabilities.iter().enumerate().flat_map(of_receiver).collect()
+    }
+
+    /// The part of a piece within an interval, s.
+    fn during(
+        &self,
+        (piece, probability): (Piece, f64),
+        receiver: usize,
+        [from_s, to_s]: [f64; 2],
+    ) -> MatchedPiece {
+        let points = self.located.tracklets[piece.tracklet].points.iter();
+        let pieces = points.zip(&self.located.detections[piece.tracklet]).take(piece.end).skip(piece.first);
+        let within = pieces.filter(|(point, _)| (from_s..=to_s).contains(&point.time_s));
+        let detections: Vec<usize> = within.map(|(_, at)| *at).collect();
+        self.piece(piece, &detections, receiver, probability)
+    }
+
+    fn piece(&self, piece: Piece, detections: &[usize], receiver: usize, probability: f64) -> MatchedPiece {
+        MatchedPiece {
+            tracker_id: self.scene.tracklets[piece.tracklet].tracker_id.clone(),
+            detections: detections.to_vec(),
+            receiver_id: self.scene.receiver_ids[receiver].clone(),
+            probability,
+        }
+    }
+}
+
+/// The pieces of all tracklets in their order and, by receiver, the probability that its carrier is the target of each.
+pub(super) struct PiecePosterior {
+    pub(super) pieces: Vec<Piece>,
+    probabilities: Vec<Vec<f64>>,
 }
 
 /// A piece of a tracklet and the receiver, by its index, that its target carries most probably.
@@ -259,16 +341,26 @@ pub(super) struct OwnedPiece {
     pub(super) probability: f64,
 }
 
-/// The pieces of all tracklets in their order, each with its most probable receiver; none without receivers. Each receiver
-/// has its fixes and the offset of its clock, s.
-pub(super) fn owned_pieces(
+impl PiecePosterior {
+    /// Each piece with its most probable receiver; none without receivers.
+    pub(super) fn owned(&self) -> impl Iterator<Item = OwnedPiece> {
+        self.pieces.iter().enumerate().filter_map(|(at, piece)| {
+            let all = self.probabilities.iter().map(|own| own[at]).enumerate();
+            let (receiver, probability) = all.max_by(|one, other| one.1.total_cmp(&other.1))?;
+            Some(OwnedPiece { piece: *piece, receiver, probability })
+        })
+    }
+}
+
+/// The posterior of all pieces. Each receiver has its fixes and the offset of its clock, s.
+pub(super) fn piece_posterior(
     tracklets: &[Tracklet],
     receivers: &[(&[TimedFix], f64)],
     model: &EvidenceModel,
     settings: &ChainSettings,
     random: &mut impl Rng,
     cancellation: Cancellation<'_>,
-) -> Result<Vec<OwnedPiece>> {
+) -> Result<PiecePosterior> {
     let pieces = cuts::pieces(tracklets, receivers, model, settings);
     let table = PieceTable::new(tracklets, pieces, model.motion, settings);
     let chains: Vec<Vec<Chain>> = receivers
@@ -278,13 +370,12 @@ pub(super) fn owned_pieces(
             Ok(table.chains(fixes, *offset_s, model, settings))
         })
         .collect::<Result<_>>()?;
+    let company = Company::new(&table.tracks, settings.max_gap_s);
     let probabilities = posterior(&chains, table.pieces.len(), random, cancellation)?;
-    let owned = |(at, piece): (usize, &Piece)| {
-        let all = probabilities.iter().map(|own| own[at]).enumerate();
-        let (receiver, probability) = all.max_by(|one, other| one.1.total_cmp(&other.1))?;
-        Some(OwnedPiece { piece: *piece, receiver, probability })
-    };
-    Ok(table.pieces.iter().enumerate().filter_map(owned).collect())
+    let shared =
+        probabilities.iter().zip(receivers).map(|(own, receiver)| company.shared(own, *receiver, model));
+    let probabilities = shared.collect();
+    Ok(PiecePosterior { pieces: table.pieces, probabilities })
 }
 
 /// The clock offset of each receiver with the largest evidence, over all chains, under a normal prior.

@@ -6,7 +6,7 @@ use super::cancellation::Cancellation;
 use super::chains::{Chain, ChainSettings};
 use super::cuts;
 use super::evidence::{EvidenceModel, LikelihoodRatio};
-use super::matching::{MatchSettings, clock_grid};
+use super::matching::{MatchSettings, clock_grid, piece_posterior};
 use super::placement::{Density, GroundPrior, PlacementSearch};
 use super::tracklet::{SceneMotion, TimedFix, TrackPoint, Tracklet};
 use crate::domain::{GaussMarkovNoise, NoiseCorrelation};
@@ -124,6 +124,53 @@ fn a_swap_in_the_middle_of_a_tracklet_is_cut() {
     let of = |tracklet| pieces.iter().filter(move |piece| piece.tracklet == tracklet);
     assert_eq!(of(0).count(), 1, "{pieces:?}");
     assert!(of(1).any(|piece| (52..=68).contains(&piece.end)), "{pieces:?}");
+}
+
+/// The most probable receiver of each tracklet with the probability of being its carrier's.
+fn owners(tracklets: &[Tracklet], fixes: &[Vec<TimedFix>]) -> Vec<(usize, f64)> {
+    let receivers: Vec<(&[TimedFix], f64)> = fixes.iter().map(|own| (own.as_slice(), 0.0)).collect();
+    let settings = ChainSettings::default();
+    let mut random = stream(1, 1);
+    let posterior =
+        piece_posterior(tracklets, &receivers, &MODEL, &settings, &mut random, Cancellation::NEVER);
+    let owned = posterior.expect("not cancelled");
+    owned.owned().map(|own| (own.receiver, own.probability)).collect()
+}
+
+/// Two tracklets 0.6 m apart, of which the second is seen for a share of the time.
+fn in_company(share: f64) -> [Tracklet; 2] {
+    let mut beside = walk([0.0, 0.6], 1.5);
+    beside.points.truncate((share * beside.points.len() as f64) as usize);
+    [walk([0.0, 0.0], 1.5), beside]
+}
+
+#[test]
+fn companions_share_a_receiver() {
+    for seed in 1..=5 {
+        let [own, beside] = in_company(1.0);
+        let fixes = vec![carried(&own, seed)];
+        let found = owners(&[own, beside, walk([20.0, -9.0], -1.0)], &fixes);
+        let [own, beside, far] = [0, 1, 2].map(|at| found[at].1);
+        assert!(own < 0.9 && beside < 0.9 && own + beside > 0.9 && far < 0.05, "{seed}: {found:?}");
+    }
+}
+
+#[test]
+fn who_is_still_seen_when_the_companion_has_left_is_more_probable() {
+    for seed in 1..=5 {
+        let tracklets = in_company(0.7);
+        let found = owners(&tracklets, &[carried(&tracklets[0], seed)]);
+        assert!(found[0].1 > found[1].1 && found[1].1 > 0.0, "{seed}: {found:?}");
+    }
+}
+
+#[test]
+fn who_has_no_company_keeps_the_receiver() {
+    let tracklets = [walk([0.0, 0.0], 1.5), walk([12.0, 0.6], 1.5)];
+    for seed in 1..=3 {
+        let found = owners(&tracklets, &[carried(&tracklets[0], seed)]);
+        assert!(found[0].1 > 0.9, "{seed}: {found:?}");
+    }
 }
 
 fn chain(pieces: &[usize], log_weight: f64) -> Chain {

@@ -56,7 +56,7 @@ impl Tracklet {
     }
 
     /// The position at an instant on the straight line between neighbours at most `max_gap_s` apart.
-    fn at(&self, time_s: f64, max_gap_s: f64) -> Option<TrackPoint> {
+    pub(super) fn at(&self, time_s: f64, max_gap_s: f64) -> Option<TrackPoint> {
         let next = self.points.partition_point(|point| point.time_s < time_s);
         let after = self.points.get(next)?;
         let Some(before) = next.checked_sub(1).map(|at| &self.points[at]) else {

@@ -16,7 +16,7 @@ use super::chains::ChainSettings;
 use super::companions::missed_companion_factor;
 use super::evidence::EvidenceModel;
 use super::live::LiveMatchSettings;
-use super::matching::{LEAST_WHITE_SIGMA_M, owned_pieces};
+use super::matching::{LEAST_WHITE_SIGMA_M, piece_posterior};
 use super::tracklet::{SceneMotion, TimedFix, TrackPoint, Tracklet};
 use crate::domain::{GaussMarkovNoise, ReceiverId, ReceiverMatch, Result};
 use crate::geo::EastNorth;
@@ -126,12 +126,13 @@ impl WorldReceiverWindow {
         let timed: Vec<(&[TimedFix], f64)> = fixes.iter().map(|own| (own.as_slice(), 0.0)).collect();
         let gnss = GaussMarkovNoise::PHONE.with_white_at_least(LEAST_WHITE_SIGMA_M * LEAST_WHITE_SIGMA_M);
         let model = EvidenceModel { gnss, motion: SceneMotion::of(&tracklets) };
-        let owned =
-            owned_pieces(&tracklets, &timed, &model, &ChainSettings::default(), random, cancellation)?;
+        let posterior =
+            piece_posterior(&tracklets, &timed, &model, &ChainSettings::default(), random, cancellation)?;
         let (tracks, receivers): (Vec<_>, Vec<_>) =
             (self.tracks.keys().collect(), self.fixes.keys().collect());
         // What was found before a cut is no evidence about the target after it.
-        let current = owned.iter().filter(|own| own.piece.end == tracklets[own.piece.tracklet].points.len());
+        let current =
+            posterior.owned().filter(|own| own.piece.end == tracklets[own.piece.tracklet].points.len());
         let matched = current.map(|own| {
             let receiver_id = receivers[own.receiver].clone();
             let probability = own.probability * missed_companion_factor();

@@ -13,7 +13,8 @@ use crate::domain::{
     Association, ClockOffset, Error, ErrorKind, ImageSize, ReceiverId, Receivers, Result, TargetId, TrackerId,
 };
 use crate::fusion::association::{
-    Cancellation, MatchLimits, MatchSettings, Matching, WorldScores, match_with_model, match_without_model,
+    Cancellation, MatchLimits, MatchSettings, MatchedGroup, MatchedPiece, Matching, WorldScores,
+    match_with_model, match_without_model,
 };
 use crate::model::Regressor;
 
@@ -75,6 +76,8 @@ pub struct MatchReport {
     pub unsure_detections: u64,
     /// Sure pairs, in order of receiver and time.
     pub pairs: Vec<MatchedPair>,
+    /// Tracklets that share a receiver with that probability, none of them sure, in order of receiver and time.
+    pub groups: Vec<SharedReceiver>,
     /// Clock offsets found, beside those given.
     pub clock_offsets: Vec<(ReceiverId, ClockOffset)>,
     /// The scores of the search of a camera without a model.
@@ -93,6 +96,30 @@ pub struct MatchedPair {
     pub to: Timestamp,
     /// Number of boxes.
     pub detections: u64,
+    pub probability: f64,
+}
+
+/// A receiver whose carrier is one of several tracklets that are seen at one time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SharedReceiver {
+    /// The receiver.
+    pub receiver_id: ReceiverId,
+    /// First instant at which all members are seen.
+    pub from: Timestamp,
+    /// Last instant at which all members are seen.
+    pub to: Timestamp,
+    /// Posterior probability that one of the members is the carrier.
+    pub probability: f64,
+    /// The members, the most probable first.
+    pub members: Vec<GroupMember>,
+}
+
+/// A tracklet of a group.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GroupMember {
+    /// Id that the tracker gave it.
+    pub tracker_id: TargetId,
+    /// Posterior probability that this one is the carrier.
     pub probability: f64,
 }
 
@@ -168,6 +195,21 @@ impl Recording {
             })
             .collect();
         pairs.sort_by(|one, other| (&one.receiver_id, one.from).cmp(&(&other.receiver_id, other.from)));
+        let shared = |group: &MatchedGroup| {
+            let times = group.members.iter().flat_map(|member| &member.detections);
+            let times: BTreeSet<Timestamp> = times.map(|at| self.detections[*at].time).collect();
+            let member = |own: &MatchedPiece| GroupMember {
+                tracker_id: own.tracker_id.clone(),
+                probability: own.probability,
+            };
+            Some(SharedReceiver {
+                receiver_id: group.receiver_id().clone(),
+                from: *times.first()?,
+                to: *times.last()?,
+                probability: group.probability(),
+                members: group.members.iter().map(member).collect(),
+            })
+        };
         let unsure = matching
             .pieces
             .iter()
@@ -180,6 +222,7 @@ impl Recording {
             matched_detections: pairs.iter().map(|pair| pair.detections).sum(),
             unsure_detections: unsure.map(|piece| piece.detections.len() as u64).sum(),
             pairs,
+            groups: matching.groups.iter().filter_map(shared).collect(),
             clock_offsets: matching.clock_offsets.clone(),
             world,
         }

@@ -76,7 +76,9 @@ pub use live::{
     SinkFeeds, SinkPosition, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent, TargetUpdate,
     TrackPoint, UnplacedBox, WantedEvents, WantedPositions, WorldSighting, WorldTrackPoint, WorldTracks,
 };
-pub use matching::{Associations, MatchReport, MatchRequest, MatchedPair, MatchedRecording};
+pub use matching::{
+    Associations, GroupMember, MatchReport, MatchRequest, MatchedPair, MatchedRecording, SharedReceiver,
+};
 pub use models::{GnssErrorEstimate, Models};
 pub use paired_import::{PairedImport, PairedReport};
 pub use pictures::Pictures;

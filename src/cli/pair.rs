@@ -17,8 +17,8 @@ use super::rejected_rows::print_reasons;
 use super::summary::{Summary, SummaryFlags};
 use super::{DataFolder, MissingData, camera_id, open_app, receiver_id, runtime, target_id};
 use crate::app::{
-    MatchReport, MatchRequest, MatchedPair, PairingCounts, Part, Recording, RecordingLimits, RejectedParts,
-    of_part,
+    GroupMember, MatchReport, MatchRequest, MatchedPair, PairingCounts, Part, Recording, RecordingLimits,
+    RejectedParts, SharedReceiver, of_part,
 };
 use crate::clock::Clock;
 use crate::config::Limits;
@@ -410,10 +410,21 @@ fn print_match(summary: &Summary, report: &MatchReport) -> anyhow::Result<()> {
             pair.tracker_id, pair.receiver_id, pair.from, pair.to, pair.detections, pair.probability
         ))?;
     }
+    for group in &report.groups {
+        let members: Vec<&str> = group.members.iter().map(|own| own.tracker_id.as_str()).collect();
+        summary.line(&format_args!(
+            "one of {} is {} from {} to {}, probability {:.3}",
+            members.join(", "),
+            group.receiver_id,
+            group.from,
+            group.to,
+            group.probability
+        ))?;
+    }
     Ok(())
 }
 
-/// The matched rows, in the names of the answer over REST, and the scores of the search without a model.
+/// The matched rows, in the names of the answer over REST, the groups, and the scores of the search without a model.
 fn match_document(report: &MatchReport) -> serde_json::Value {
     let pair = |pair: &MatchedPair| {
         serde_json::json!({
@@ -423,6 +434,16 @@ fn match_document(report: &MatchReport) -> serde_json::Value {
             "to": pair.to,
             "detections": pair.detections,
             "probability": pair.probability,
+        })
+    };
+    let group = |group: &SharedReceiver| {
+        let member = |own: &GroupMember| serde_json::json!({ "tracker_id": own.tracker_id.as_str(), "probability": own.probability });
+        serde_json::json!({
+            "receiver_id": group.receiver_id.as_str(),
+            "from": group.from,
+            "to": group.to,
+            "probability": group.probability,
+            "members": group.members.iter().map(member).collect::<Vec<_>>(),
         })
     };
     let offset = |(id, offset): &(ReceiverId, ClockOffset)| serde_json::json!({ "receiver_id": id.as_str(), "offset_s": offset.seconds() });
@@ -435,6 +456,7 @@ fn match_document(report: &MatchReport) -> serde_json::Value {
         "matched_detections": report.matched_detections,
         "unsure_detections": report.unsure_detections,
         "pairs": report.pairs.iter().map(pair).collect::<Vec<_>>(),
+        "groups": report.groups.iter().map(group).collect::<Vec<_>>(),
         "clock_offsets": report.clock_offsets.iter().map(offset).collect::<Vec<_>>(),
         "scores": report.world.map(|world| serde_json::json!({
             "best": world.best,

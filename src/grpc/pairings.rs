@@ -7,7 +7,8 @@ use super::proto;
 use super::proto::pair_samples_request::Kind;
 use super::statuses::broken;
 use crate::app::{
-    App, ImportOptions, MatchReport, PairedImport, PairedReport, PairingCounts, Part, Spool, Spooled,
+    App, GroupMember, ImportOptions, MatchReport, PairedImport, PairedReport, PairingCounts, Part, Spool,
+    Spooled,
 };
 use crate::config::Limits;
 use crate::domain::{
@@ -245,6 +246,17 @@ impl From<MatchReport> for proto::MatchReport {
             detections: pair.detections,
             probability: pair.probability,
         });
+        let member = |member: GroupMember| proto::GroupMember {
+            tracker_id: member.tracker_id.to_string(),
+            probability: member.probability,
+        };
+        let groups = report.groups.into_iter().map(|group| proto::MatchedGroup {
+            receiver_id: group.receiver_id.to_string(),
+            from: Some(timestamp(group.from)),
+            to: Some(timestamp(group.to)),
+            probability: group.probability,
+            members: group.members.into_iter().map(member).collect(),
+        });
         Self {
             tracklets: report.tracklets as u64,
             receivers: report.receivers as u64,
@@ -253,6 +265,7 @@ impl From<MatchReport> for proto::MatchReport {
             matched_detections: report.matched_detections,
             unsure_detections: report.unsure_detections,
             pairs: pairs.collect(),
+            groups: groups.collect(),
         }
     }
 }

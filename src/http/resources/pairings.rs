@@ -99,6 +99,9 @@ struct Matching {
     unsure_detections: u64,
     /// Pairs of tracklet and receiver with at least that probability.
     pairs: Vec<MatchedPair>,
+    /// Groups of tracklets: one of them shows the carrier with at least that probability, none of them alone does. No
+    /// samples are made of their boxes.
+    groups: Vec<MatchedGroup>,
 }
 
 /// A tracklet, or a part of it, and the receiver that its target carries.
@@ -117,6 +120,32 @@ struct MatchedPair {
     /// Number of boxes.
     detections: u64,
     /// Posterior probability of the match, 0 to 1.
+    probability: f64,
+}
+
+/// Targets that walk together while all are seen: one of them carries the receiver.
+#[derive(Serialize, ToSchema)]
+struct MatchedGroup {
+    /// The receiver.
+    receiver_id: String,
+    /// First instant at which all members are seen.
+    #[schema(value_type = String, format = DateTime)]
+    from: jiff::Timestamp,
+    /// Last instant at which all members are seen.
+    #[schema(value_type = String, format = DateTime)]
+    to: jiff::Timestamp,
+    /// Posterior probability that one of the members carries it, 0 to 1.
+    probability: f64,
+    /// The members, the most probable first.
+    members: Vec<GroupMember>,
+}
+
+/// A tracklet of a group.
+#[derive(Serialize, ToSchema)]
+struct GroupMember {
+    /// Id that the tracker gave the boxes.
+    tracker_id: String,
+    /// Posterior probability that this one carries the receiver, 0 to 1.
     probability: f64,
 }
 
@@ -372,6 +401,17 @@ impl From<MatchReport> for Matching {
             detections: own.detections,
             probability: own.probability,
         };
+        let member = |own: app::GroupMember| GroupMember {
+            tracker_id: own.tracker_id.as_str().to_owned(),
+            probability: own.probability,
+        };
+        let group = |own: app::SharedReceiver| MatchedGroup {
+            receiver_id: own.receiver_id.as_str().to_owned(),
+            from: own.from,
+            to: own.to,
+            probability: own.probability,
+            members: own.members.into_iter().map(member).collect(),
+        };
         Self {
             tracklets: report.tracklets,
             receivers: report.receivers,
@@ -380,6 +420,7 @@ impl From<MatchReport> for Matching {
             matched_detections: report.matched_detections,
             unsure_detections: report.unsure_detections,
             pairs: report.pairs.into_iter().map(pair).collect(),
+            groups: report.groups.into_iter().map(group).collect(),
         }
     }
 }

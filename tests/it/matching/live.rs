@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
-use serde_json::json;
+use serde_json::{Value, json};
 use sightfix::grpc::proto;
 
 use super::crowd::{Crowd, Recorded};
@@ -300,6 +300,53 @@ async fn an_import_matches_trackers_ids_with_receivers() {
     // The same again stores nothing new.
     let again = server.send("POST", PATH, &kind, body).await.expect(200).json();
     assert_eq!((&again["accepted"], &again["duplicate"]), (&json!(0), &json!(all)), "{again}");
+}
+
+/// Somebody walks beside a walker, half a box to the right.
+fn with_companion(recorded: &Recorded, walker: usize) -> Recorded {
+    let mut lines = recorded.detections.lines();
+    let mut detections = format!("{}\n", lines.next().expect("a header"));
+    let mut walkers = Vec::new();
+    for (line, own) in lines.zip(&recorded.walkers) {
+        writeln!(detections, "{line}").expect("memory");
+        walkers.push(*own);
+        if *own == walker {
+            let mut cells: Vec<String> = line.split(',').map(str::to_owned).collect();
+            let number = |cell: &String| cell.parse::<f64>().expect("a number");
+            cells[1] = format!("beside-{}", cells[1]);
+            cells[2] = format!("{:.2}", number(&cells[2]) + 0.5 * number(&cells[4]));
+            writeln!(detections, "{}", cells.join(",")).expect("memory");
+            walkers.push(LIVE.walkers);
+        }
+    }
+    Recorded { detections, fixes: recorded.fixes.clone(), walkers }
+}
+
+#[tokio::test]
+async fn a_receiver_within_a_group_is_given_to_the_group() {
+    const PATH: &str = "/v1/cameras/yard/samples/pairings?match=true";
+    let folder = data_folder();
+    let server = trained_yard(folder.path()).await;
+    let (content_type, body) = multipart(&with_companion(&LIVE.recorded(), 0));
+    let kind = [("content-type", content_type.as_str())];
+    let report = server.send("POST", PATH, &kind, body).await.expect(200).json();
+    let matching = &report["matching"];
+    let text = |of: &Value, name: &str| of[name].as_str().expect("text").to_owned();
+    let pairs = matching["pairs"].as_array().expect("pairs");
+    assert!(!pairs.is_empty() && pairs.iter().all(|pair| text(pair, "receiver_id") == "phone-1"), "{report}");
+    let groups = matching["groups"].as_array().expect("groups");
+    let shared: Vec<&Value> = groups.iter().filter(|own| text(own, "receiver_id") == "phone-0").collect();
+    assert!(!shared.is_empty(), "{report}");
+    for group in shared {
+        let members = group["members"].as_array().expect("members");
+        let ids: Vec<String> = members.iter().map(|own| text(own, "tracker_id")).collect();
+        let beside = ids.iter().find(|id| id.starts_with("beside-")).expect("the companion");
+        assert!(ids.contains(&beside.trim_start_matches("beside-").to_owned()), "{group}");
+        let share = |own: &Value| own["probability"].as_f64().expect("a number");
+        let sum: f64 = members.iter().map(share).sum();
+        assert!(sum >= 0.9 && members.iter().all(|own| share(own) < 0.9), "{group}");
+        assert!((share(group) - sum).abs() < 1e-9, "{group}");
+    }
 }
 
 #[tokio::test]

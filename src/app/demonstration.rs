@@ -1,7 +1,9 @@
 //! The demonstration that the server shows, and its end.
 
+use std::pin::pin;
 use std::sync::Mutex;
 
+use futures_util::TryStreamExt as _;
 use tokio_util::sync::CancellationToken;
 
 use super::App;
@@ -38,10 +40,11 @@ impl Demonstration {
 
 impl App {
     /// Ends the demonstration and removes its cameras, sites and connections with all that they have stored. Does nothing
-    /// if none is shown. After an error it can be repeated.
+    /// if none is shown. Waits until training runs of its cameras have ended, which it cancels. After an error it can be
+    /// repeated.
     ///
     /// # Errors
-    /// `RunLive` while one of its cameras is trained; a fault of the store.
+    /// `RunLive` if somebody trains one of its cameras again meanwhile; a fault of the store.
     pub async fn end_demonstration(&self) -> Result<()> {
         let Some((parts, stop)) = lock(&self.demonstration.0).clone() else { return Ok(()) };
         stop.cancel();
@@ -49,12 +52,30 @@ impl App {
             removed(self.connections().delete(id, None).await, ErrorKind::ConnectionNotFound)?;
         }
         for id in &parts.cameras {
-            removed(self.cameras().delete(id, None).await, ErrorKind::CameraNotFound)?;
+            let deleted = async {
+                self.end_training(id).await?;
+                self.cameras().delete(id, None).await
+            };
+            removed(deleted.await, ErrorKind::CameraNotFound)?;
         }
         for id in &parts.sites {
             removed(self.sites().delete(id, None).await, ErrorKind::SiteNotFound)?;
         }
         *lock(&self.demonstration.0) = None;
+        Ok(())
+    }
+
+    /// Cancels the training run of a camera that has not ended, which is the latest if there is one, and waits for its end.
+    async fn end_training(&self, camera: &CameraId) -> Result<()> {
+        let training = self.training();
+        let latest = training.list(camera, None, 1).await?.items.pop();
+        let Some(run) = latest.filter(|run| !run.state.has_ended()) else { return Ok(()) };
+        match training.cancel(camera, run.id).await {
+            Err(error) if error.kind() != ErrorKind::RunEnded => return Err(error),
+            _ => {}
+        }
+        let mut seen = pin!(training.watch(camera, run.id).await?);
+        while seen.try_next().await?.is_some() {}
         Ok(())
     }
 }

@@ -189,6 +189,12 @@ async fn the_demonstration_prints_requests_that_work() {
     while server.get("/v1/connections/demo-display").await.expect(200).json()["status"]["messages"] == 0 {
         tokio::time::sleep(std::time::Duration::from_millis(500)).await;
     }
+    // It ends although one of its cameras is being trained.
+    let long = json!({"recipe": "hybrid", "epochs": 2_000});
+    server.post("/v1/cameras/demo/training-runs", &long).await.expect(202);
+    server.send("DELETE", "/v1/demonstration", &[], "").await.expect(204);
+    let cameras = server.get("/v1/cameras").await.expect(200).json();
+    assert_eq!(cameras["items"], json!([]), "{cameras}");
 }
 
 /// A model file of an earlier format loads, and is more accurate than the receiver alone.

@@ -15,12 +15,13 @@ pub(super) fn routes() -> OpenApiRouter<Rest> {
 /// End the demonstration
 ///
 /// Stops its simulated cameras, phones and ship, and removes its cameras, site and connections with all that they have
-/// stored. Does nothing if none is shown; `demonstration` of `/v1/server` says so.
+/// stored. Training runs of its cameras are cancelled first. Does nothing if none is shown; `demonstration` of `/v1/server`
+/// says so.
 #[utoipa::path(
     delete, path = "/v1/demonstration", tag = "service",
     responses(
         (status = 204, description = "None is shown now"),
-        (status = 409, description = "One of its cameras is being trained; repeat it", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "One of its cameras was given another training run meanwhile; repeat it", body = Problem, content_type = "application/problem+json"),
     )
 )]
 async fn end_demonstration(CallerApp(app): CallerApp) -> ApiResult {

@@ -3,34 +3,10 @@
 //! Who walks together has nearly the same likelihood, so none of them is sure, but the carrier is one of them. Tracklets
 //! that are seen at one time exclude each other as the carrier's, so the probability of the group is the sum of theirs.
 
-use super::matching::MatchedPiece;
-use crate::domain::ReceiverId;
-
 /// Members at most: more are a crowd.
 const MAX_MEMBERS: usize = 4;
 /// A group is together for at least this time, s: tracklets overlap for less while a tracker changes an id.
 const LEAST_S: f64 = 2.0;
-
-/// The tracklets of which one shows the carrier of a receiver while all of them are seen.
-#[derive(Debug, Clone, PartialEq)]
-pub struct MatchedGroup {
-    /// The members with their boxes of that time, the most probable first; all have the same receiver.
-    pub members: Vec<MatchedPiece>,
-}
-
-impl MatchedGroup {
-    /// Posterior probability that one of the members shows the carrier.
-    #[must_use]
-    pub fn probability(&self) -> f64 {
-        self.members.iter().map(|member| member.probability).sum()
-    }
-
-    /// The receiver of all members.
-    #[must_use]
-    pub fn receiver_id(&self) -> &ReceiverId {
-        &self.members[0].receiver_id
-    }
-}
 
 /// A tracklet, or a part of it, that may be the carrier's.
 #[derive(Debug, Clone, Copy, PartialEq)]

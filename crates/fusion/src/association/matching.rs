@@ -11,7 +11,7 @@ use super::companions::View;
 use super::company::Company;
 use super::cuts;
 use super::evidence::EvidenceModel;
-use super::groups::{Candidate, MatchedGroup, groups};
+use super::groups::{Candidate, groups};
 use super::recording::Scene;
 use super::tracklet::{SceneMotion, TimedFix, Tracklet};
 use crate::domain::{
@@ -97,6 +97,27 @@ pub struct MatchedPiece {
     pub receiver_id: ReceiverId,
     /// Posterior probability.
     pub probability: f64,
+}
+
+/// The tracklets of which one shows the carrier of a receiver while all of them are seen.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MatchedGroup {
+    /// The members with their boxes of that time, the most probable first; all have the same receiver.
+    pub members: Vec<MatchedPiece>,
+}
+
+impl MatchedGroup {
+    /// Posterior probability that one of the members shows the carrier.
+    #[must_use]
+    pub fn probability(&self) -> f64 {
+        self.members.iter().map(|member| member.probability).sum()
+    }
+
+    /// The receiver of all members.
+    #[must_use]
+    pub fn receiver_id(&self) -> &ReceiverId {
+        &self.members[0].receiver_id
+    }
 }
 
 /// Which boxes show the carriers of which receivers.

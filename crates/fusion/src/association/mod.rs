@@ -25,10 +25,11 @@ mod world_receivers;
 
 pub use self::cancellation::Cancellation;
 pub use self::chains::ChainSettings;
-pub use self::groups::MatchedGroup;
 pub use self::joint::{JointMatch, WorldScores, joint_pairing, match_without_model};
 pub use self::live::{LiveMatchSettings, LiveMatches, LiveWindow};
-pub use self::matching::{MatchLimits, MatchSettings, MatchedPiece, Matching, match_with_model};
+pub use self::matching::{
+    MatchLimits, MatchSettings, MatchedGroup, MatchedPiece, Matching, match_with_model,
+};
 pub use self::world_receivers::{WorldReceiverWindow, WorldReceivers};
 
 #[cfg(test)]

@@ -11,7 +11,7 @@ use super::companions::View;
 use super::company::Company;
 use super::cuts;
 use super::evidence::EvidenceModel;
-use super::groups::{Candidate, groups};
+use super::groups::{Candidate, Together, groups};
 use super::recording::Scene;
 use super::tracklet::{SceneMotion, TimedFix, Tracklet};
 use crate::domain::{
@@ -301,35 +301,45 @@ impl ShownPieces<'_> {
 
     /// The pieces that share a receiver.
     fn groups(&self, min_probability: f64) -> Vec<MatchedGroup> {
-        let of_receiver = |(receiver, probabilities): (usize, &Vec<f64>)| {
-            let shares = probabilities.iter().zip(&self.own_probabilities).map(|(own, factor)| own * factor);
-            let known = self.posterior.pieces.iter().zip(shares);
-            let known: Vec<(Piece, f64)> = known
-                .filter(|(_, own)| *own >= LEAST_PROBABILITY)
-                .map(|(piece, own)| (*piece, own))
-                .collect();
-            let candidate = |(piece, probability): &(Piece, f64)| {
-                let points = &self.located.tracklets[piece.tracklet].points[piece.first..piece.end];
-                Some(Candidate {
-                    span_s: [points.first()?.time_s, points.last()?.time_s],
-                    probability: *probability,
-                })
-            };
-            let candidates: Vec<Candidate> = known.iter().filter_map(candidate).collect();
+        let pieces = &self.posterior.pieces;
+        let of_receiver = |receiver: usize| {
+            let probable =
+                |at: &usize| self.shown(&self.posterior.shares[receiver], *at) >= LEAST_PROBABILITY;
+            let known: Vec<usize> = (0..pieces.len()).filter(probable).collect();
+            let candidates: Vec<Candidate> = known.iter().map(|at| self.candidate(receiver, *at)).collect();
             let found = groups(&candidates, min_probability).into_iter();
-            let group = |(members, span_s): (Vec<usize>, [f64; 2])| MatchedGroup {
-                members: members.iter().map(|at| self.during(known[*at], receiver, span_s)).collect(),
+            let member = |(at, probability): &(usize, f64), span_s: [f64; 2]| {
+                self.during(pieces[known[*at]], receiver, *probability, span_s)
+            };
+            let group = |(members, span_s): Together| MatchedGroup {
+                members: members.iter().map(|own| member(own, span_s)).collect(),
             };
             found.map(group).collect::<Vec<_>>()
         };
-        self.posterior.probabilities.iter().enumerate().flat_map(of_receiver).collect()
+        (0..self.posterior.shares.len()).flat_map(of_receiver).collect()
+    }
+
+    /// What its target's unseen companions leave a piece of its probability.
+    fn shown(&self, probabilities: &[f64], at: usize) -> f64 {
+        self.own_probabilities[at] * probabilities[at]
+    }
+
+    fn candidate(&self, receiver: usize, at: usize) -> Candidate {
+        let Piece { tracklet, first, end } = self.posterior.pieces[at];
+        let points = &self.located.tracklets[tracklet].points;
+        Candidate {
+            span_s: [points[first].time_s, points[end - 1].time_s],
+            posterior: self.shown(&self.posterior.probabilities[receiver], at),
+            share: self.shown(&self.posterior.shares[receiver], at),
+        }
     }
 
     /// The part of a piece within an interval, s.
     fn during(
         &self,
-        (piece, probability): (Piece, f64),
+        piece: Piece,
         receiver: usize,
+        probability: f64,
         [from_s, to_s]: [f64; 2],
     ) -> MatchedPiece {
         let points = self.located.tracklets[piece.tracklet].points.iter();
@@ -349,10 +359,13 @@ impl ShownPieces<'_> {
     }
 }
 
-/// The pieces of all tracklets in their order and, by receiver, the probability that its carrier is the target of each.
+/// The pieces of all tracklets in their order.
 pub(super) struct PiecePosterior {
     pub(super) pieces: Vec<Piece>,
+    /// By receiver, the probability that its carrier is the target of each piece, before companions share it.
     probabilities: Vec<Vec<f64>>,
+    /// The same as companions share it.
+    shares: Vec<Vec<f64>>,
 }
 
 /// A piece of a tracklet and the receiver, by its index, that its target carries most probably.
@@ -366,7 +379,7 @@ impl PiecePosterior {
     /// Each piece with its most probable receiver; none without receivers.
     pub(super) fn owned(&self) -> impl Iterator<Item = OwnedPiece> {
         self.pieces.iter().enumerate().filter_map(|(at, piece)| {
-            let all = self.probabilities.iter().map(|own| own[at]).enumerate();
+            let all = self.shares.iter().map(|own| own[at]).enumerate();
             let (receiver, probability) = all.max_by(|one, other| one.1.total_cmp(&other.1))?;
             Some(OwnedPiece { piece: *piece, receiver, probability })
         })
@@ -395,8 +408,8 @@ pub(super) fn piece_posterior(
     let probabilities = posterior(&chains, table.pieces.len(), random, cancellation)?;
     let shared =
         probabilities.iter().zip(receivers).map(|(own, receiver)| company.shared(own, *receiver, model));
-    let probabilities = shared.collect();
-    Ok(PiecePosterior { pieces: table.pieces, probabilities })
+    let shares = shared.collect();
+    Ok(PiecePosterior { pieces: table.pieces, probabilities, shares })
 }
 
 /// The clock offset of each receiver with the largest evidence, over all chains, under a normal prior.

@@ -10,11 +10,11 @@ use crate::domain::{BoundingBox, Detection};
 /// Share of targets in company.
 const IN_COMPANY: f64 = 0.4;
 /// Probability that a target in view is not among the boxes.
-const MISSED: f64 = 0.1;
+pub(super) const MISSED: f64 = 0.1;
 /// Probability that the companion of a target at the border of the view is out of view.
 const OUT_OF_VIEW: f64 = 0.5;
 /// A companion is still out of view after the target has been inside for this time with probability 1/e, s.
-const ENTERING_S: f64 = 2.0;
+pub(super) const ENTERING_S: f64 = 2.0;
 /// Distance of companions in the image, in heights of their boxes.
 const APART_HEIGHTS: f64 = 0.7;
 

@@ -13,6 +13,7 @@
 //! `L` is the log-likelihood ratio of all fixes during X or Y, compared with X where X is seen and else with Y; `L_X` is that
 //! of the fixes during X; `u_Y` is the probability that X is unseen beside Y while Y is seen alone.
 
+use super::companions::{ENTERING_S, MISSED};
 use super::evidence::{EvidenceModel, LikelihoodRatio};
 use super::tracklet::{MAX_OVERLAP_S, Residual, TimedFix, Tracklet};
 
@@ -21,10 +22,6 @@ const APART_M: f64 = 1.5;
 /// Companions are both seen for at least this time, s, and for this share of the shorter tracklet.
 const LEAST_TOGETHER_S: f64 = 2.0;
 const LEAST_TOGETHER_SHARE: f64 = 0.5;
-/// Probability that a companion is not among the boxes for a long time.
-const MISSED: f64 = 0.1;
-/// Companions enter and leave the view within about this time, s.
-const ENTERING_S: f64 = 2.0;
 /// Differences of companions' positions are means over the time so long before and after a fix, s.
 const SMOOTHED_S: f64 = 3.0;
 /// A receiver's posterior probability below which a tracklet has nothing to share.

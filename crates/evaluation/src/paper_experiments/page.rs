@@ -4,10 +4,11 @@ use std::fmt::Write as _;
 
 use super::cases::key;
 use super::marks::{self, Mark, ONE_STEP, TRACK, TWO_STEP};
-use super::scores::CaseScore;
+use super::scores::{CaseScore, MethodScore};
 use super::simulated::Worlds;
 use super::walks::{DEFAULT, WALKS, WalkCurves};
-use crate::{Trace, Truth, plots};
+use crate::report::or_dash;
+use crate::{ErrorMetrics, Trace, Truth, plots};
 
 /// The methods of the main table and their titles.
 const COLUMNS: [(&str, &str); 8] = [
@@ -103,6 +104,7 @@ pub(super) fn page(
         cpu_s / 60.0
     );
     main_table(&mut page, scores);
+    radius_table(&mut page, scores);
     mark_table(&mut page, &marks::marks(scores));
     page.push_str("## Pictures\n\n");
     for Picture { name, caption, .. } in pictures {
@@ -136,21 +138,69 @@ do not count here.
 
 fn main_table(page: &mut String, scores: &[CaseScore]) {
     let _ = writeln!(page, "{READING}");
-    let titles: String = COLUMNS.iter().map(|(_, title)| format!(" {title} |")).collect();
-    let _ = writeln!(page, "| case |{titles} ratio | misses |");
-    let _ = writeln!(page, "|---|{}", "---|".repeat(COLUMNS.len() + 2));
+    let mut titles: Vec<&str> = COLUMNS.iter().map(|(_, title)| *title).collect();
+    titles.extend(["ratio", "misses"]);
+    let cells = |score: &CaseScore| {
+        let mut cells: Vec<String> = COLUMNS.iter().map(|(method, _)| cell(score, method)).collect();
+        cells.extend([or_dash(marks::ratio_to_best(score), 2), marks::missed(score).join(", ")]);
+        cells
+    };
+    case_table(page, scores, &titles, cells);
+}
+
+const READING_OF_RADII: &str = "\
+## How honest the radii are
+
+Mean error in m and, in brackets, the least and the largest mean of one world; the shares of true positions inside the
+stated 50 % and 95 % radius, in %; the mean of the latter, `r95`, in m; and `NLL`, the mean negative log likelihood of the
+true positions (a proper score: radii that are too small and those that are too large make it larger).
+";
+
+/// Ranges over worlds, coverage, mean radius and score of two-step fusion and of tracks.
+fn radius_table(page: &mut String, scores: &[CaseScore]) {
+    let _ = writeln!(page, "{READING_OF_RADII}");
+    let mut titles = Vec::new();
+    for method in ["two-step", "track"] {
+        titles.extend([method, "inside 50 %", "inside 95 %", "r95", "NLL"]);
+    }
+    let cells = |score: &CaseScore| {
+        [TWO_STEP, TRACK].into_iter().flat_map(|method| radius_cells(score.method(method))).collect()
+    };
+    case_table(page, scores, &titles, cells);
+}
+
+fn radius_cells(method: Option<&MethodScore>) -> [String; 5] {
+    let Some(MethodScore { with_box: Some(figures), range_m: Some([low_m, high_m]), .. }) = method else {
+        return std::array::from_fn(|_| "-".to_owned());
+    };
+    let ErrorMetrics { mean_m, coverage50, coverage95, mean_r95_m, negative_log_likelihood, .. } = figures;
+    let range = if low_m < high_m { format!(" ({low_m:.2} to {high_m:.2})") } else { String::new() };
+    let share = |share: &Option<f64>| or_dash(share.map(|share| 100.0 * share), 0);
+    [
+        format!("{mean_m:.2}{range}"),
+        share(coverage50),
+        share(coverage95),
+        or_dash(*mean_r95_m, 2),
+        or_dash(*negative_log_likelihood, 2),
+    ]
+}
+
+/// A table with a row per case and a heading per group of cases.
+fn case_table(
+    page: &mut String,
+    scores: &[CaseScore],
+    titles: &[&str],
+    cells: impl Fn(&CaseScore) -> Vec<String>,
+) {
+    let _ = writeln!(page, "| case | {} |", titles.join(" | "));
+    let _ = writeln!(page, "|---|{}", "---|".repeat(titles.len()));
     let mut group = "";
     for score in scores.iter().filter(|score| score.in_main_table) {
         if score.group != group {
             group = score.group;
-            let _ = writeln!(page, "| **{group}** |{}", " |".repeat(COLUMNS.len() + 2));
+            let _ = writeln!(page, "| **{group}** |{}", " |".repeat(titles.len()));
         }
-        let _ = write!(page, "| {} |", score.case.title);
-        for (method, _) in COLUMNS {
-            let _ = write!(page, " {} |", cell(score, method));
-        }
-        let ratio = marks::ratio_to_best(score).map_or_else(|| "-".to_owned(), |ratio| format!("{ratio:.2}"));
-        let _ = writeln!(page, " {ratio} | {} |", marks::missed(score).join(", "));
+        let _ = writeln!(page, "| {} | {} |", score.case.title, cells(score).join(" | "));
     }
     page.push('\n');
 }

@@ -21,6 +21,8 @@ pub(super) struct MethodScore {
     pub(super) report: MethodReport,
     /// On the rows with a box, so that methods with a box and without are compared on the same rows.
     pub(super) with_box: Option<ErrorMetrics>,
+    /// The least and the largest mean error of one world on these rows, m.
+    pub(super) range_m: Option<[f64; 2]>,
 }
 
 /// The figures of a case, means over its worlds.
@@ -45,9 +47,13 @@ pub(super) struct CaseScore {
 }
 
 impl CaseScore {
+    pub(super) fn method(&self, name: &str) -> Option<&MethodScore> {
+        self.methods.iter().find(|one| one.name == name)
+    }
+
     /// The figures of a method on rows with a box.
     pub(super) fn figures(&self, method: &str) -> Option<&ErrorMetrics> {
-        self.methods.iter().find(|one| one.name == method)?.with_box.as_ref()
+        self.method(method)?.with_box.as_ref()
     }
 
     pub(super) fn mean_m(&self, method: &str) -> Option<f64> {
@@ -130,7 +136,8 @@ impl WorldScore {
                 report.metrics = all;
             }
             let with_box = metrics_of(points().filter(has_box));
-            Some(MethodScore { name: trace.method.clone(), report, with_box })
+            let range_m = with_box.as_ref().map(|one| [one.mean_m; 2]);
+            Some(MethodScore { name: trace.method.clone(), report, with_box, range_m })
         };
         Self {
             methods: evaluation.traces.iter().filter_map(score).collect(),
@@ -185,7 +192,15 @@ fn average(name: &str, worlds: &[WorldScore]) -> Option<MethodScore> {
         train_cpu_s: every.iter().map(|one| one.report.train_cpu_s).sum::<f64>() / count,
         fuse_us: every.iter().map(|one| one.report.fuse_us).sum::<f64>() / count,
     };
-    Some(MethodScore { name: name.to_owned(), report, with_box: ErrorMetrics::over_seeds(&with_box) })
+    let widest = |[low, high]: [f64; 2], [other_low, other_high]: [f64; 2]| {
+        [low.min(other_low), high.max(other_high)]
+    };
+    Some(MethodScore {
+        name: name.to_owned(),
+        report,
+        with_box: ErrorMetrics::over_seeds(&with_box),
+        range_m: every.iter().filter_map(|one| one.range_m).reduce(widest),
+    })
 }
 
 /// The predictions of all worlds per method; rows are those of their own worlds.

@@ -23,7 +23,8 @@ fn method(name: &str, mean_m: f64, coverage: Option<f64>) -> MethodScore {
     let metrics = figures(mean_m, coverage);
     let report =
         MethodReport { metrics: metrics.clone(), seed_means_m: vec![mean_m], train_cpu_s: 1.0, fuse_us: 1.0 };
-    MethodScore { name: name.to_owned(), report, with_box: Some(metrics) }
+    let range_m = Some([mean_m - 0.5, mean_m + 0.5]);
+    MethodScore { name: name.to_owned(), report, with_box: Some(metrics), range_m }
 }
 
 fn score(key: &str, methods: Vec<MethodScore>) -> CaseScore {
@@ -102,6 +103,10 @@ fn the_page_begins_with_a_table_of_means_and_coverages_and_says_which_marks_are_
     assert!(page.contains("| 1 of 2 cases | **missed** |"), "{page}");
     assert!(page.contains("](accuracy/walks_square.svg)") && page.contains("`the command`"), "{page}");
     assert!(page.contains("| `auto` | 20.00 (90) | 10.00 (90) |"), "{page}");
+    assert!(
+        page.contains("| case large | 1.90 (1.40 to 2.40) | 0 | 95 | 3.61 | "),
+        "range, coverage and radius of two-step: {page}"
+    );
     // Every row of a table has the cells of its head.
     for table in page.split("\n\n").filter(|part| part.starts_with('|')) {
         let cells: Vec<usize> = table.lines().map(|line| line.matches('|').count()).collect();

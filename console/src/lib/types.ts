@@ -52,6 +52,15 @@ export interface HistorySettings {
   max_bytes: number;
   coarsen_m: number;
 }
+/** A point of the ground whose place in the image and on the earth is known. */
+export interface KnownPoint {
+  x_px: number;
+  y_px: number;
+  /** Null while it is not entered. */
+  position: { longitude_deg: number | null; latitude_deg: number | null };
+  sigma_m: number;
+}
+
 export interface Camera {
   id: string;
   display_name: string;
@@ -65,6 +74,7 @@ export interface Camera {
   site?: string;
   snapshot?: SnapshotSource;
   history?: HistorySettings;
+  known_points: KnownPoint[];
   retrain_when_moved: boolean;
   learn_automatically: boolean;
   revision: number;

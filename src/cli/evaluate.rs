@@ -94,6 +94,10 @@ pub(super) struct Evaluate {
     /// Seed of the first draw, for --site
     #[arg(long, alias = "first-redraw", value_name = "N", requires = "site", default_value_t = 1, value_parser = clap::value_parser!(u64).range(0..=MAX_FIRST_DRAW))]
     first_draw: u64,
+    /// Number of known points of each camera that take part in the training, for --site: true places near the corners of the
+    /// image, with an error of 0.3 m per axis
+    #[arg(long, value_name = "N", requires = "site", conflicts_with = "matching", default_value_t = 0, value_parser = clap::value_parser!(u8).range(0..=4))]
+    known_points: u8,
     /// Evaluate how boxes are matched with receivers instead of the world tracks, for --site: with a model that is known
     #[arg(long = "match", requires = "draws")]
     matching: bool,
@@ -122,7 +126,8 @@ impl Evaluate {
                 evaluate_site::evaluate_matching(folder, self.image_size, &draws, self.without_model)?
                     .to_json()?
             } else {
-                evaluate_site::evaluate(folder, self.image_size, &draws)?.to_json()?
+                evaluate_site::evaluate(folder, self.image_size, &draws, usize::from(self.known_points))?
+                    .to_json()?
             };
             return self.json.as_ref().map_or(Ok(()), |path| write_text(path, &report));
         }
@@ -148,7 +153,7 @@ impl Evaluate {
             box_shift_px: self.box_shift_px,
             cpu_s: process_cpu_s,
         };
-        let input = FitInput { samples: &train.samples, unpaired: &train.unpaired };
+        let input = FitInput { samples: &train.samples, unpaired: &train.unpaired, known_points: &[] };
         let evaluation = evaluate_with_progress(input, &test, &truth, &options)?;
         if !self.json.as_deref().is_some_and(files::is_standard) {
             print_line(&format_args!("{}", evaluation.report.table().trim_end()))?;

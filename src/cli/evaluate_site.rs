@@ -40,6 +40,7 @@ pub(super) fn evaluate(
     folder: &Path,
     image_size: Option<ImageSize>,
     draws: &Draws,
+    known_points: usize,
 ) -> anyhow::Result<SiteReport> {
     let recording = site_recording::read(folder, image_size)?;
     let mut cases = cases(&recording);
@@ -50,13 +51,15 @@ pub(super) fn evaluate(
     let mut progress = Progress::new("{spinner} {pos}/{len} {msg}");
     let count = draws.count.max(1);
     for draw in 0..count {
-        let drawn = draws.of(&recording, draw);
+        let of_draw =
+            |draw| draws.of(&recording, draw).with_known_points(known_points, draws.first_seed + draw);
+        let drawn = of_draw(draw);
         let trained =
             [SiteTraining::Together, SiteTraining::Apart].map(|training| train_site(&drawn, training));
         let [together, apart] = trained;
         let (together, apart) = (together?, apart?);
         // The fixes that are matched with tracks must not be those by which the cameras were trained.
-        let of_other_phones = (draws.carriers()).then(|| draws.of(&recording, draw + KNOWN_MODEL_SEEDS));
+        let of_other_phones = draws.carriers().then(|| of_draw(draw + KNOWN_MODEL_SEEDS));
         let of_other_phones =
             of_other_phones.map(|it| train_site(&it, SiteTraining::Together)).transpose()?;
         let of_other_phones = of_other_phones.as_ref().unwrap_or(&together);

@@ -59,6 +59,7 @@ pub(super) fn read(folder: &Path, image_size: Option<ImageSize>) -> anyhow::Resu
             .collect(),
         receivers,
         targets,
+        known_points: Vec::new(),
     })
 }
 

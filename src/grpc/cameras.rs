@@ -9,8 +9,9 @@ use super::proto::camera_service_server::CameraService;
 use super::statuses::{Reply, answer};
 use crate::app::{App, Learning, LearningState};
 use crate::domain::{
-    Camera, CameraChange, CameraId, ClockOffset, Error, GnssBiasSigma, GnssError, ImageSize, NewCamera,
-    Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, SiteId, SnapshotSource, TargetClass, TargetId,
+    Camera, CameraChange, CameraId, ClockOffset, Error, GnssBiasSigma, GnssError, ImageSize, KnownPoint,
+    NewCamera, Receiver, ReceiverId, Receivers, Result, Revision, SigmaM, SiteId, SnapshotSource,
+    TargetClass, TargetId,
 };
 
 pub(super) struct Cameras {
@@ -136,6 +137,7 @@ fn new_camera(id: CameraId, profile: proto::CameraProfile) -> Result<NewCamera> 
             .map(|it| SnapshotSource::new(&it.url, it.username, it.password))
             .transpose()?,
         history: profile.history.map(history_settings).transpose()?,
+        known_points: known_points(&profile.known_points)?,
         id: named.id,
     })
 }
@@ -166,6 +168,22 @@ fn receiver(given: &proto::Receiver) -> Result<Receiver> {
         clock_offset: ClockOffset::from_seconds(given.clock_offset_s)?,
         sigma: given.sigma_m.map(SigmaM::new).transpose()?,
         receiver_id: named.receiver_id,
+    })
+}
+
+fn known_points(given: &[proto::KnownPoint]) -> Result<Vec<KnownPoint>> {
+    let point = |(index, given): (usize, &proto::KnownPoint)| {
+        known_point(given).map_err(|error| error.under(&format!("known_points[{index}]")))
+    };
+    given.iter().enumerate().map(point).collect()
+}
+
+fn known_point(given: &proto::KnownPoint) -> Result<KnownPoint> {
+    let at = given.position.unwrap_or_default();
+    Ok(KnownPoint {
+        image_px: [given.x_px, given.y_px],
+        position: position(at).map_err(|error| error.under("position"))?,
+        sigma_m: SigmaM::new(given.sigma_m.unwrap_or(KnownPoint::DEFAULT_SIGMA_M))?,
     })
 }
 
@@ -210,6 +228,7 @@ fn present(profile: &proto::CameraProfile) -> Vec<&'static str> {
         ("site", profile.site.is_some()),
         ("snapshot", profile.snapshot.is_some()),
         ("history", profile.history.is_some()),
+        ("known_points", !profile.known_points.is_empty()),
     ];
     has.into_iter().filter_map(|(field, has)| has.then_some(field)).collect()
 }
@@ -259,7 +278,15 @@ impl From<NewCamera> for proto::CameraProfile {
                 password: None,
             }),
             history: profile.history.map(Into::into),
+            known_points: profile.known_points.into_iter().map(Into::into).collect(),
         }
+    }
+}
+
+impl From<KnownPoint> for proto::KnownPoint {
+    fn from(point: KnownPoint) -> Self {
+        let [x_px, y_px] = point.image_px;
+        Self { x_px, y_px, position: Some(point.position.into()), sigma_m: Some(point.sigma_m.metres()) }
     }
 }
 

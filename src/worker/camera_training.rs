@@ -50,7 +50,8 @@ impl Trained for CameraId {
         app.store.append_log(run.id, claim.fence, app.clock.now(), &line).await?;
         Ok(Box::new(move |sink| {
             let mut held_out = Vec::new();
-            let input = FitInput { samples: &samples, unpaired: &unpaired };
+            let known_points = &camera.profile.known_points;
+            let input = FitInput { samples: &samples, unpaired: &unpaired, known_points };
             let fitted = model::fit(input, &options, &mut |event| {
                 if let FitEvent::HeldOut(errors) = event {
                     held_out = errors.to_vec();

@@ -69,7 +69,7 @@ impl Job for EvaluationJob {
         Ok(Box::new(move |sink| {
             let mut cancelled = false;
             let evaluated = evaluate(
-                FitInput { samples: &train, unpaired: &unpaired },
+                FitInput { samples: &train, unpaired: &unpaired, known_points: &camera.profile.known_points },
                 &test,
                 &truth,
                 &options,

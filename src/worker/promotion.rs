@@ -233,18 +233,30 @@ async fn measure(
     if new.held_out.is_empty() {
         return Ok(Finding::Incomparable(number, "the new one has no held-out errors to compare"));
     }
+    let recorded = app.store.model(id, number).await?.metadata;
+    if let Some(why) = by_other_known_points(number, &recorded, &new.artifact.metadata) {
+        return Ok(Finding::NoRival(why));
+    }
     let onset_at = app.store.camera_move(id, number).await?.map(|moved| moved.onset_at);
     let counts =
         |time: Timestamp| new.range.contains(time) && onset_at.is_none_or(|onset_at| time >= onset_at);
     let stored = app.store.held_out_errors(id, number).await?;
     if stored.is_empty() {
-        let recorded = app.store.model(id, number).await?.metadata;
         let comparison = against_recorded(new, &active, &recorded);
         return Ok(Finding::Measured(Measured { number, own: Comparison::default(), all: comparison }));
     }
     let own = on_active_samples(new, &stored, &counts)?;
     let all = on_new_samples(new, &active, &stored, &counts).plus(&own);
     Ok(Finding::Measured(Measured { number, own, all }))
+}
+
+/// Why fixes cannot judge between two versions: they have the bias that known points take away.
+fn by_other_known_points(number: u32, active: &ModelMetadata, new: &ModelMetadata) -> Option<String> {
+    let [active, new] =
+        [active, new].map(|it| it.parameters.get("known_points").copied().unwrap_or_default());
+    (new > 0.0 && new != active).then(|| {
+        format!("it was trained with {new} known points and version {number} with {active}, and the fixes cannot judge that")
+    })
 }
 
 /// Both versions on the stored held-out samples of the active one. The new version's error there is its own

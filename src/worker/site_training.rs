@@ -115,6 +115,7 @@ impl CameraSamples {
             image_size: profile.image_size,
             gnss_error: profile.gnss_error,
             gnss_bias_sigma_m: profile.gnss_bias_sigma.map(GnssBiasSigma::metres),
+            known_points: &profile.known_points,
         }
     }
 }

@@ -1,5 +1,5 @@
 //! Error of the recipe `gaussian_process` against the number of receivers, with and without boxes that have
-//! no fix: the table of docs/explanation/method.md. One walk is one receiver on one way through the picture.
+//! no fix, and with known points: tables of docs/explanation/method.md. One walk is one receiver on one way through the picture.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -10,14 +10,14 @@ use rand::SeedableRng as _;
 use rand::seq::SliceRandom as _;
 use rand_chacha::ChaCha8Rng;
 use sightfix::domain::{
-    BoundingBox, Detection, GnssError, ImageSize, ReceivedFix, Receivers, Recipe, Sample, TargetClass,
-    TargetId, TimeBounds,
+    BoundingBox, Detection, GnssError, ImageSize, KnownPoint, ReceivedFix, Receivers, Recipe, Sample, SigmaM,
+    TargetClass, TargetId, TimeBounds,
 };
 use sightfix::exchange::{FixFormat, Format, RowRules, read_detections, read_received_fixes};
 use sightfix::fusion::pairing::{PairingRule, PairingSettings, pair};
-use sightfix::geo::{Position, distance_m};
+use sightfix::geo::{EastNorth, LocalPlane, Position, distance_m};
 use sightfix::model::{FitInput, FitOptions, fit};
-use sightfix::simulation::{Options, Scene, simulate_split};
+use sightfix::simulation::{Options, Scene, simulate_split, standard_normal};
 
 const RECEIVERS: [usize; 5] = [2, 3, 5, 10, 20];
 
@@ -32,6 +32,13 @@ struct Recording {
     tests: Vec<(BoundingBox, Position)>,
 }
 
+/// What there is beside the samples of receivers.
+#[derive(Debug, Clone, Copy)]
+struct Beside {
+    boxes: bool,
+    known_points: usize,
+}
+
 /// Mean error, m, and share of the true positions within the stated 95 % radius.
 #[derive(Default, Clone, Copy)]
 struct Score {
@@ -41,13 +48,13 @@ struct Score {
 
 impl Recording {
     /// Fits a model with the fixes of some receivers, chosen by the seed; `None` if they do not suffice.
-    fn score(&self, receivers: usize, seed: u64, with_boxes: bool) -> Option<Score> {
+    fn score(&self, receivers: usize, seed: u64, beside: Beside) -> Option<Score> {
         let mut carriers: Vec<&TargetId> = self.samples.keys().collect();
         carriers.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
         let samples: Vec<Sample> =
             carriers.iter().take(receivers).flat_map(|carrier| self.samples[*carrier].clone()).collect();
         let paired: BTreeSet<_> = samples.iter().map(|sample| (sample.time, &sample.target_id)).collect();
-        let is_unpaired = |own: &&Detection| with_boxes && !paired.contains(&(own.time, &own.target_id));
+        let is_unpaired = |own: &&Detection| beside.boxes && !paired.contains(&(own.time, &own.target_id));
         let unpaired: Vec<Detection> = self.boxes.iter().filter(is_unpaired).cloned().collect();
         let options = FitOptions {
             recipe: Recipe::GaussianProcess,
@@ -57,9 +64,13 @@ impl Recording {
             gnss_error: GnssError::Unknown,
             gnss_bias_sigma_m: None,
         };
-        let input = FitInput { samples: &samples, unpaired: &unpaired };
+        let input = FitInput {
+            samples: &samples,
+            unpaired: &unpaired,
+            known_points: &self.known_points(beside.known_points, seed),
+        };
         let fitted = fit(input, &options, &mut |_| ControlFlow::Continue(()))
-            .inspect_err(|error| println!("{receivers} receivers, draw {seed}: {error}"));
+            .inspect_err(|error| println!("{receivers} receivers, draw {seed}, {beside:?}: {error}"));
         let model = fitted.ok()?.load().expect("a model");
         let mut score = Score::default();
         for (bounding_box, truth) in &self.tests {
@@ -70,6 +81,26 @@ impl Recording {
             score.coverage += f64::from(u8::from(error_m <= r95_m)) / self.tests.len() as f64;
         }
         Some(score)
+    }
+
+    /// Places near the corners of what is seen, where an operator has read them off a picture and a map.
+    fn known_points(&self, count: usize, seed: u64) -> Vec<KnownPoint> {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let corners = [[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]];
+        let mut point = |[right, down]: [f64; 2]| {
+            let along =
+                |(own, _): &&(BoundingBox, Position)| right * own.foot_px()[0] + down * own.foot_px()[1];
+            let (own, truth) =
+                self.tests.iter().max_by(|one, other| along(one).total_cmp(&along(other))).expect("boxes");
+            let mut draw_m = || KnownPoint::DEFAULT_SIGMA_M * standard_normal(&mut random);
+            let error = EastNorth { east_m: draw_m(), north_m: draw_m() };
+            KnownPoint {
+                image_px: own.foot_px(),
+                position: LocalPlane::new(*truth).to_position(error),
+                sigma_m: SigmaM::new(KnownPoint::DEFAULT_SIGMA_M).expect("a sigma"),
+            }
+        };
+        corners.into_iter().take(count).map(&mut point).collect()
     }
 
     /// A simulated square with 40 walkers, each of whom passes for a minute.
@@ -159,14 +190,24 @@ fn plaza_fixes(path: &Path) -> Vec<ReceivedFix> {
     rows.map(|row| row.expect("a file").expect("a row")).collect()
 }
 
+/// Whether boxes without a fix take part.
+const BOXES: [Beside; 2] =
+    [Beside { boxes: false, known_points: 0 }, Beside { boxes: true, known_points: 0 }];
+/// Numbers of known points.
+const KNOWN_POINTS: [Beside; 3] = [
+    Beside { boxes: true, known_points: 0 },
+    Beside { boxes: true, known_points: 1 },
+    Beside { boxes: true, known_points: 4 },
+];
+
 /// A line of the table: mean errors of all recordings and draws with that many receivers.
-fn compare(name: &str, recordings: &[Recording], receivers: usize, draws: u64) -> String {
+fn compare(name: &str, recordings: &[Recording], receivers: usize, draws: u64, besides: &[Beside]) -> String {
     let mut cells = format!("| {name} | {receivers} |");
-    for with_boxes in [false, true] {
+    for beside in besides {
         let scores: Vec<Score> = recordings
             .iter()
             .filter(|recording| recording.samples.len() >= receivers)
-            .flat_map(|recording| (1..=draws).filter_map(|draw| recording.score(receivers, draw, with_boxes)))
+            .flat_map(|recording| (1..=draws).filter_map(|draw| recording.score(receivers, draw, *beside)))
             .collect();
         let mean = |of: fn(&Score) -> f64| scores.iter().map(of).sum::<f64>() / scores.len() as f64;
         let (mean_m, coverage) = (mean(|score| score.mean_m), mean(|score| score.coverage));
@@ -184,7 +225,7 @@ fn boxes_without_a_fix_help_where_few_walkers_carry_a_receiver() {
     println!("{HEADER}");
     let worlds: Vec<Recording> = (1..=3).map(|world| Recording::simulated(4_100 + world)).collect();
     for receivers in [2, 3, 5, 10] {
-        println!("{}", compare("simulated square", &worlds, receivers, 1));
+        println!("{}", compare("simulated square", &worlds, receivers, 1, &BOXES));
     }
 }
 
@@ -201,7 +242,45 @@ fn shared_boxes_without_a_fix_by_number_of_receivers() {
         );
         for receivers in RECEIVERS {
             let draws = if receivers < 10 { 3 } else { 1 };
-            println!("{}", compare(&format!("plaza {camera}"), &recording, receivers, draws));
+            println!("{}", compare(&format!("plaza {camera}"), &recording, receivers, draws, &BOXES));
+        }
+    }
+}
+
+const HEADER_OF_POINTS: &str = "| case | receivers | no known point: mean | coverage | one | coverage | four | coverage |\n\
+                                |---|---:|---:|---:|---:|---:|---:|---:|";
+
+/// The mean error of a line's cells that are metres.
+fn means_m(line: &str) -> Vec<f64> {
+    line.split('|').filter_map(|cell| cell.trim().strip_suffix(" m")?.parse().ok()).collect()
+}
+
+#[test]
+#[ignore = "fits 96 models"]
+fn known_points_help_where_few_walkers_carry_a_receiver() {
+    println!("{HEADER_OF_POINTS}");
+    let worlds: Vec<Recording> = (1..=8).map(|world| Recording::simulated(4_200 + world)).collect();
+    for receivers in [1, 2, 5, 10] {
+        let line = compare("simulated square", &worlds, receivers, 1, &KNOWN_POINTS);
+        println!("{line}");
+        let means_m = means_m(&line);
+        assert!(means_m[2] < 0.6 * means_m[0], "{line}");
+    }
+}
+
+#[test]
+#[ignore = "needs ../shared/data"]
+fn shared_known_points_by_number_of_receivers() {
+    let draws = std::env::var("DRAWS").map_or(2, |draws| draws.parse().expect("a number"));
+    println!("{HEADER_OF_POINTS}");
+    for camera in ["c1", "c2", "c3"] {
+        let recording = [Recording::plaza(camera)];
+        for receivers in [2, 5, 20] {
+            let name = format!("plaza {camera}");
+            let line = compare(&name, &recording, receivers, draws, &KNOWN_POINTS);
+            println!("{line}");
+            let means_m = means_m(&line);
+            assert!(means_m[2] < means_m[0], "{line}");
         }
     }
 }

@@ -29,6 +29,7 @@ mod hostile;
 mod http2_floods;
 mod inference;
 mod job_leases;
+mod known_points;
 mod layering;
 mod limit_edges;
 mod limits;

@@ -58,8 +58,8 @@ pub use samples::mirroring::{FootPosition, is_mirrored, median_position};
 pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};
 pub use samples::sequences::fix_sequences;
 pub use site::{
-    RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, SitePosition, box_at,
-    fit_site,
+    RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SiteKnownPoint, SiteMaps, SitePair,
+    SitePosition, box_at, fit_site,
 };
 pub use view_area::ViewArea;
 

@@ -111,6 +111,52 @@ impl SnapshotSource {
     }
 }
 
+/// A point of the ground whose place in the image and on the earth is known, such as the corner of a kerb.
+#[derive(Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+pub(super) struct KnownPoint {
+    /// From the left of the image, px.
+    #[schema(minimum = 0.0, example = 512.5)]
+    x_px: f64,
+    /// From the top of the image, px.
+    #[schema(minimum = 0.0, example = 640.0)]
+    y_px: f64,
+    /// Where it is on the earth.
+    position: Position,
+    /// Standard deviation of that position per axis, m, 0.001 to 10,000; 0.3 if left out.
+    #[serde(default = "KnownPoint::default_sigma_m")]
+    #[schema(minimum = 0.001, maximum = 10_000.0, default = 0.3)]
+    sigma_m: f64,
+}
+
+impl KnownPoint {
+    const fn default_sigma_m() -> f64 {
+        domain::KnownPoint::DEFAULT_SIGMA_M
+    }
+
+    fn to_domain(&self) -> Result<domain::KnownPoint> {
+        Ok(domain::KnownPoint {
+            image_px: [self.x_px, self.y_px],
+            position: self.position.to_domain().map_err(|error| error.under("position"))?,
+            sigma_m: SigmaM::new(self.sigma_m)?,
+        })
+    }
+}
+
+impl From<domain::KnownPoint> for KnownPoint {
+    fn from(point: domain::KnownPoint) -> Self {
+        let [x_px, y_px] = point.image_px;
+        Self { x_px, y_px, position: point.position.into(), sigma_m: point.sigma_m.metres() }
+    }
+}
+
+fn known_points(given: &[KnownPoint]) -> Result<Vec<domain::KnownPoint>> {
+    let point = |(index, given): (usize, &KnownPoint)| {
+        given.to_domain().map_err(|error| error.under(&format!("known_points[{index}]")))
+    };
+    given.iter().enumerate().map(point).collect()
+}
+
 /// A camera to be stored. Nothing but the id is needed; no calibration is ever asked for.
 #[derive(Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
@@ -157,6 +203,10 @@ struct CameraDraft {
     snapshot: Option<SnapshotSource>,
     /// How finished tracks are kept; none are if left out.
     history: Option<HistorySettings>,
+    /// Points of the ground whose place is known: evidence of training beside the fixes.
+    #[serde(default)]
+    #[schema(max_items = 100)]
+    known_points: Vec<KnownPoint>,
 }
 
 impl CameraDraft {
@@ -178,6 +228,7 @@ impl CameraDraft {
             site: self.site.as_deref().map(SiteId::new).transpose().map_err(|error| error.at("site"))?,
             snapshot: self.snapshot.map(SnapshotSource::into_domain).transpose()?,
             history: self.history.map(HistorySettings::to_domain).transpose()?,
+            known_points: known_points(&self.known_points)?,
             id: blank.id,
         })
     }
@@ -230,6 +281,9 @@ struct CameraChange {
     snapshot: Option<SnapshotSource>,
     /// New settings of the history; null keeps no more tracks. What is kept already stays until it is deleted or too old.
     history: Option<HistorySettings>,
+    /// New known points, all of them, for runs to come; null is none.
+    #[schema(max_items = 100)]
+    known_points: Option<Vec<KnownPoint>>,
 }
 
 /// The change that a merge patch makes of a stored camera.
@@ -280,6 +334,8 @@ pub(super) struct Camera {
     /// How finished tracks are kept; missing if none are.
     #[serde(skip_serializing_if = "Option::is_none")]
     history: Option<HistorySettings>,
+    /// Points of the ground whose place is known.
+    known_points: Vec<KnownPoint>,
     /// Counts the changes of the profile, from 1.
     revision: u64,
     /// When it was made.
@@ -330,6 +386,7 @@ impl Camera {
             site: profile.site.map(|site| site.as_str().to_owned()),
             snapshot: profile.snapshot.as_ref().map(SnapshotSource::shown),
             history: profile.history.map(Into::into),
+            known_points: profile.known_points.into_iter().map(Into::into).collect(),
             revision: revision.0,
             created_at,
             updated_at,

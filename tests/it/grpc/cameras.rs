@@ -29,6 +29,15 @@ fn yard() -> proto::CameraProfile {
             max_bytes: Some(5_000_000),
             coarsen_m: 2.5,
         }),
+        known_points: vec![proto::KnownPoint {
+            x_px: 320.5,
+            y_px: 410.0,
+            position: Some(proto::Position {
+                longitude_deg: Some(103.98681),
+                latitude_deg: Some(30.6280135),
+            }),
+            sigma_m: Some(0.5),
+        }],
     }
 }
 

@@ -8,6 +8,7 @@ use super::bounding_box::ImageSize;
 use super::error::{Error, ErrorKind, Result};
 use super::gnss_error::{GnssBiasSigma, GnssError};
 use super::history::HistorySettings;
+use super::known_point::KnownPoint;
 use super::names::{CameraId, SiteId, TargetClass, check_labels, check_text};
 use super::receiver::Receivers;
 use super::recipe::Recipe;
@@ -53,6 +54,8 @@ pub struct NewCamera {
     pub snapshot: Option<SnapshotSource>,
     /// How finished tracks are kept; `None` keeps none.
     pub history: Option<HistorySettings>,
+    /// Points of the ground whose place is known, evidence of training runs.
+    pub known_points: Vec<KnownPoint>,
 }
 
 impl NewCamera {
@@ -75,6 +78,7 @@ impl NewCamera {
             site: None,
             snapshot: None,
             history: None,
+            known_points: Vec::new(),
         }
     }
 
@@ -83,6 +87,7 @@ impl NewCamera {
     pub fn check(self) -> Result<Self> {
         check_text("display_name", &self.display_name, 200)?;
         check_labels(&self.labels)?;
+        KnownPoint::check_all(&self.known_points, self.image_size)?;
         if self.target_classes.len() > 64 {
             return Err(Error::invalid("target_classes", "must be at most 64"));
         }
@@ -151,11 +156,13 @@ pub struct CameraChange {
     pub snapshot: Option<Option<SnapshotSource>>,
     /// New settings of the history; `Some(None)` keeps no more tracks.
     pub history: Option<Option<HistorySettings>>,
+    /// New known points; they replace all.
+    pub known_points: Option<Vec<KnownPoint>>,
 }
 
 impl CameraChange {
     /// Names of the fields that can be changed, on both transports.
-    pub const FIELDS: [&str; 14] = [
+    pub const FIELDS: [&str; 15] = [
         "display_name",
         "image_size",
         "gnss_error",
@@ -170,6 +177,7 @@ impl CameraChange {
         "site",
         "snapshot",
         "history",
+        "known_points",
     ];
 
     /// The fields of a profile that are named, by [`Self::FIELDS`].
@@ -190,6 +198,7 @@ impl CameraChange {
             site: is_named("site").then_some(profile.site),
             snapshot: is_named("snapshot").then_some(profile.snapshot),
             history: is_named("history").then_some(profile.history),
+            known_points: is_named("known_points").then_some(profile.known_points),
         }
     }
 
@@ -217,6 +226,7 @@ impl CameraChange {
                 None => profile.snapshot,
             },
             history: self.history.unwrap_or(profile.history),
+            known_points: self.known_points.unwrap_or(profile.known_points),
         }
         .check()
     }

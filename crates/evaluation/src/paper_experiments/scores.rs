@@ -192,9 +192,8 @@ fn average(name: &str, worlds: &[WorldScore]) -> Option<MethodScore> {
         train_cpu_s: every.iter().map(|one| one.report.train_cpu_s).sum::<f64>() / count,
         fuse_us: every.iter().map(|one| one.report.fuse_us).sum::<f64>() / count,
     };
-    let widest = |[low, high]: [f64; 2], [other_low, other_high]: [f64; 2]| {
-        [low.min(other_low), high.max(other_high)]
-    };
+    let widest =
+        |[low, high]: [f64; 2], [other_low, other_high]: [f64; 2]| [low.min(other_low), high.max(other_high)];
     Some(MethodScore {
         name: name.to_owned(),
         report,

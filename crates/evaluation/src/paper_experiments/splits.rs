@@ -74,7 +74,7 @@ impl Split {
 
     /// Returns the training input of a fit.
     pub(super) fn input(&self) -> FitInput<'_> {
-        FitInput { samples: &self.train, unpaired: &self.unpaired }
+        FitInput { samples: &self.train, unpaired: &self.unpaired, known_points: &[] }
     }
 
     /// All test sets as one, whose targets are distinguished by the number of the set, and the index of the

@@ -7,6 +7,7 @@ mod box_figures;
 mod crossing_figures;
 mod degradation;
 mod draw;
+mod known_points;
 mod matching_report;
 mod pair_figures;
 mod receiver_feed;

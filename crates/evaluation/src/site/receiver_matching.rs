@@ -102,7 +102,7 @@ impl SiteRecording {
             gnss_error: GnssError::Unknown,
             gnss_bias_sigma_m: None,
         };
-        let input = FitInput { samples: &samples, unpaired: &others };
+        let input = FitInput { samples: &samples, unpaired: &others, known_points: &[] };
         fit(input, &options, &mut |_| ControlFlow::Continue(()))?.load().map_err(FitError::Unusable)
     }
 

@@ -6,6 +6,7 @@ use jiff::Timestamp;
 
 use crate::domain::{BoundingBox, CameraId, ImageSize, ReceivedFix, ReceiverId, TargetId};
 use crate::geo::{EastNorth, LocalPlane};
+use crate::model::SiteKnownPoint;
 use crate::simulation::SimulatedSite;
 
 /// A target that no camera sees for longer than this begins another visit, s.
@@ -59,6 +60,8 @@ pub struct SiteRecording {
     pub receivers: Vec<(ReceiverId, usize)>,
     /// Names of the targets.
     pub targets: Vec<TargetId>,
+    /// Known points of the cameras; a recording has none of its own.
+    pub known_points: Vec<SiteKnownPoint>,
     /// True positions by instant and target, m.
     pub truth: BTreeMap<(Timestamp, usize), EastNorth>,
 }
@@ -105,6 +108,7 @@ impl SiteRecording {
                 .collect(),
             receivers,
             targets,
+            known_points: Vec::new(),
         }
     }
 

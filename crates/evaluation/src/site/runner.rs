@@ -13,8 +13,8 @@ use crate::domain::{BoundingBox, CameraId, ImageSize, ReceiverId};
 use crate::fusion::world::{CameraFrame, WorldDetection, WorldTrack, WorldTrackSettings, WorldTracker};
 use crate::geo::PlaneCovariance;
 use crate::model::{
-    RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, SitePosition, box_at,
-    fit_site,
+    RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SiteKnownPoint, SiteMaps, SitePair,
+    SitePosition, box_at, fit_site,
 };
 
 /// A track is reported at an instant if a camera measured it within this time, s.
@@ -95,12 +95,14 @@ pub fn train_site(recording: &SiteRecording, training: SiteTraining) -> Result<T
     let maps = match training {
         SiteTraining::Together => {
             let image_sizes = vec![recording.image_size; recording.cameras.len()];
-            vec![fit(&image_sizes, &fixes, &pairs)?]
+            vec![fit(&image_sizes, &fixes, &pairs, &recording.known_points)?]
         }
         SiteTraining::Apart => (0..recording.cameras.len())
             .map(|camera| {
                 let own: Vec<SiteFix> = fixes.iter().filter_map(|fix| fix.seen_by(camera)).collect();
-                fit(&[recording.image_size], &own, &[]).map_err(|error| match error {
+                let known = recording.known_points.iter().filter(|point| point.camera == camera);
+                let known: Vec<_> = known.map(|point| SiteKnownPoint { camera: 0, ..*point }).collect();
+                fit(&[recording.image_size], &own, &[], &known).map_err(|error| match error {
                     SiteFitError::TooFewRows { .. } => SiteFitError::TooFewRows { camera },
                     other => other,
                 })
@@ -114,8 +116,9 @@ fn fit(
     image_sizes: &[Option<ImageSize>],
     fixes: &[SiteFix],
     pairs: &[SitePair],
+    known_points: &[SiteKnownPoint],
 ) -> Result<SiteMaps, SiteFitError> {
-    fit_site(&SiteFitInput { image_sizes, fixes, pairs, correlation: RECEIVER_CORRELATION })
+    fit_site(&SiteFitInput { image_sizes, fixes, pairs, known_points, correlation: RECEIVER_CORRELATION })
 }
 
 impl TrainedSite {

@@ -380,7 +380,7 @@ impl<'a> JointSearch<'a> {
             gnss_error: GnssError::Unknown,
             gnss_bias_sigma_m: None,
         };
-        let input = FitInput { samples: &samples, unpaired: &unpaired };
+        let input = FitInput { samples: &samples, unpaired: &unpaired, known_points: &[] };
         let cancellation = self.scene.cancellation;
         let mut observer = |_: FitEvent<'_>| {
             if cancellation.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }

@@ -6,6 +6,7 @@ use crate::artifact::ModelParts;
 use crate::domain::{CandidateFinding, CandidateReport, HeldOutError, ImageSize, TrainingReport};
 use crate::geo::Position;
 use crate::recipes::Candidate;
+use crate::recipes::gaussian_process::KNOWN_POINTS;
 use crate::regressor::Regressor;
 use crate::samples::mirroring::{FootPosition, is_mirrored};
 use crate::samples::rows::{TrainingRow, TrainingRows};
@@ -186,17 +187,19 @@ fn advice(
 ) -> Vec<String> {
     let mut advice: Vec<String> = swapped_columns(rows).into_iter().collect();
     advice.extend(map_error.and_then(|own| more_walks(own, parts)));
-    if rows.targets == 1 {
+    // Known points show the bias.
+    let is_bias_seen = parts.parameters.contains_key(KNOWN_POINTS);
+    if rows.targets == 1 && !is_bias_seen {
         advice.push(
-            "let a second receiver walk: all fixes are of one receiver, and its lasting bias cannot be seen; \
-             or state gnss_bias_sigma_m in the camera's profile"
+            "let a second receiver walk, or state known_points of the ground in the camera's profile: all fixes are of one \
+             receiver, and its lasting bias cannot be seen; or state gnss_bias_sigma_m"
                 .to_owned(),
         );
     }
     let sigma_m = |name: &str| parts.parameters.get(name).map_or(0.0, |variance_m2| variance_m2.sqrt());
     let between_m = sigma_m("between_sessions_m2").max(sigma_m("error_session_m2"));
     let sessions = rows.sessions();
-    if sessions == 1 {
+    if sessions == 1 && !is_bias_seen {
         advice.push(
             "walk once more on another day: all samples are of one session, and a bias of that day cannot be seen"
                 .to_owned(),

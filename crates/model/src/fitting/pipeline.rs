@@ -18,7 +18,8 @@ use super::widening::widen_radius;
 use crate::artifact::{Artifact, FORMAT, ModelParts};
 use crate::domain::{
     CandidateReport, Detection, Error, GaussMarkovNoise, GnssError, GnssErrorSource, HeldOutError,
-    HeldOutSampleError, ImageSize, ModelMetadata, OriginDeg, Recipe, RunProgress, Sample, TrainingReport,
+    HeldOutSampleError, ImageSize, KnownPoint, ModelMetadata, OriginDeg, Recipe, RunProgress, Sample,
+    TrainingReport,
 };
 use crate::encoder::geometry::{GeometricCovariance, fit_geometry};
 use crate::encoder::projection_fit::ParameterCovariance;
@@ -45,11 +46,14 @@ pub struct FitInput<'a> {
     /// Boxes without a fix. They tell the geometry of a camera whose image size is known; recipes
     /// `gaussian_process` and `auto` use those of the class that most samples have.
     pub unpaired: &'a [Detection],
+    /// Points of the ground whose place an operator has stated. They take away the bias that all fixes have in common,
+    /// and tell the geometry where nobody walked. With any, `auto` is `gaussian_process`, which alone uses them.
+    pub known_points: &'a [KnownPoint],
 }
 
 impl<'a> From<&'a [Sample]> for FitInput<'a> {
     fn from(samples: &'a [Sample]) -> Self {
-        Self { samples, unpaired: &[] }
+        Self { samples, unpaired: &[], known_points: &[] }
     }
 }
 
@@ -112,7 +116,7 @@ pub fn fit_with<'a>(
     overrides: FitOverrides<'_>,
     observer: &mut dyn FnMut(FitEvent<'_>) -> ControlFlow<()>,
 ) -> Result<Artifact, FitError> {
-    let FitInput { samples, unpaired } = input.into();
+    let FitInput { samples, unpaired, known_points } = input.into();
     let rows = TrainingRows::new(samples).map_err(FitError::Unusable)?.thinned(MAX_ROWS);
     let unpaired = unpaired_boxes(samples, unpaired);
     let geometry = fit_geometry(&rows);
@@ -123,6 +127,7 @@ pub fn fit_with<'a>(
         image_size: options.image_size,
         gnss_bias_sigma_m: options.gnss_bias_sigma_m,
         unpaired: &unpaired,
+        known_points,
         target_height_m: target_height_m(samples.iter().map(|sample| sample.class.as_ref())),
         noise: geometry.noise,
         epochs: options.epochs,
@@ -130,7 +135,11 @@ pub fn fit_with<'a>(
         loss_weights: overrides.loss_weights,
     };
     let mut run = FitRun { observer, progress: RunProgress::default() };
-    let candidates = selected(options.recipe, overrides.candidate)?;
+    let recipe = match options.recipe {
+        Recipe::Auto if !known_points.is_empty() => Recipe::GaussianProcess,
+        stated => stated,
+    };
+    let candidates = selected(recipe, overrides.candidate)?;
     let chosen = select(samples, &rows, &context, &candidates, &mut run)?;
     let fit = FinalFit { samples, rows: &rows, context: &context, options, e_gnss_source };
     let (parts, held_out) = fit.run(&chosen, geometry.covariance, &mut run)?;
@@ -322,7 +331,7 @@ fn artifact_of(
             origin: OriginDeg { longitude_deg: origin.longitude_deg(), latitude_deg: origin.latitude_deg() },
             seed: context.seed,
             epochs: candidate.epochs(context),
-            training_rows_sha256: sha256_of(samples, context.unpaired),
+            training_rows_sha256: sha256_of(samples, context.unpaired, context.known_points),
             samples: rows.rows.len() as u32,
             targets: rows.targets,
             passes: rows.traverses,

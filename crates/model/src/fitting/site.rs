@@ -17,21 +17,22 @@ use super::widening::held_out_widening;
 use crate::artifact::{Artifact, FORMAT, ModelParts};
 use crate::domain::{
     CandidateFinding, CandidateReport, Error, ErrorKind, FeatureScale, GaussMarkovNoise, GnssError,
-    GnssErrorSource, HeldOutError, HeldOutSampleError, ImageSize, JointTraining, ModelMetadata, OriginDeg,
-    Recipe, RunProgress, Sample, TrainingReport,
+    GnssErrorSource, HeldOutError, HeldOutSampleError, ImageSize, JointTraining, KnownPoint, ModelMetadata,
+    OriginDeg, Recipe, RunProgress, Sample, TrainingReport,
 };
 use crate::encoder::features::features_of;
 use crate::geo::{EastNorth, LocalPlane};
 use crate::progress::{FitError, FitEvent, FitRun, Phase};
 use crate::recipes::gaussian_process::{
-    EPOCHS, SHARED_BIAS_SHARE, UprightStarts, target_height_m, widen_map,
+    EPOCHS, KNOWN_POINTS, SHARED_BIAS_SHARE, UprightStarts, target_height_m, widen_map,
 };
 use crate::regressor::Regressor;
 use crate::samples::rows::{HELD_OUT_BLOCKS, TrainingRow, TrainingRows, sha256_of};
 use crate::samples::target_groups::groups_of_targets;
 use crate::site::rows::SiteRows;
 use crate::site::{
-    RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SiteMaps, SitePair, fit_site_observed,
+    RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SiteKnownPoint, SiteMaps, SitePair,
+    fit_site_observed,
 };
 use crate::statistics::median;
 use crate::uncertainty::calibration::calibrate_reconstruction;
@@ -57,6 +58,8 @@ pub struct SiteCamera<'a> {
     pub gnss_error: GnssError,
     /// Standard deviation per axis, m, of the bias that all fixes have in common, if known.
     pub gnss_bias_sigma_m: Option<f64>,
+    /// Points of the ground whose place is known.
+    pub known_points: &'a [KnownPoint],
 }
 
 /// A camera's model of a joint fit.
@@ -105,7 +108,9 @@ pub fn fit_site_models(
     let upright = cameras.iter().zip(&rows).map(|(camera, own)| upright_starts(camera, own, target_height_m));
     let upright = upright.collect();
     let groups = Groups::new(&site);
-    let fit = SiteFit { cameras, rows: &rows, plane, groups, site, joint_training, upright, seed };
+    let known_points = known_points(cameras, &plane);
+    let fit =
+        SiteFit { known_points, cameras, rows: &rows, plane, groups, site, joint_training, upright, seed };
     let mut run = FitRun { observer, progress: RunProgress::default() };
     run.progress.epochs = 2 * fit.groups.count + 1 + EPOCHS * cameras.len() as u32;
     let (form, validation) = fit.select(&mut run)?;
@@ -120,6 +125,19 @@ pub fn fit_site_models(
         pairs: fit.site.pairs.len() as u32,
         disagreement_m: validation.disagreement.map(|mean| mean.value()),
     })
+}
+
+fn known_points(cameras: &[SiteCamera<'_>], plane: &LocalPlane) -> Vec<SiteKnownPoint> {
+    let of_camera = |(camera, own): (usize, &SiteCamera<'_>)| {
+        let point = |point: &KnownPoint| SiteKnownPoint {
+            camera,
+            image_px: point.image_px,
+            position: plane.to_plane(point.position),
+            variance_m2: point.sigma_m.variance_m2(),
+        };
+        own.known_points.iter().map(point).collect::<Vec<_>>()
+    };
+    cameras.iter().enumerate().flat_map(of_camera).collect()
 }
 
 fn training_rows(camera: &SiteCamera<'_>) -> Result<TrainingRows, FitError> {
@@ -230,6 +248,7 @@ struct SiteFit<'a> {
     plane: LocalPlane,
     groups: Groups,
     site: SiteRows<'a>,
+    known_points: Vec<SiteKnownPoint>,
     joint_training: &'a JointTraining,
     /// The cameras that the heights of boxes allow, where these are known.
     upright: Vec<Option<UprightStarts>>,
@@ -281,7 +300,14 @@ impl SiteFit<'_> {
         run: &mut FitRun<'_>,
     ) -> Result<SiteMaps, FitError> {
         let image_sizes: Vec<_> = self.cameras.iter().map(|camera| camera.image_size).collect();
-        self.observed(self.upright_of(form), &image_sizes, fixes, pairs, run).map_err(|error| match error {
+        let input = SiteFitInput {
+            image_sizes: &image_sizes,
+            fixes,
+            pairs,
+            known_points: &self.known_points,
+            correlation: RECEIVER_CORRELATION,
+        };
+        self.observed(self.upright_of(form), &input, run).map_err(|error| match error {
             SiteFitError::Cancelled => FitError::Cancelled,
             SiteFitError::TooFewRows { camera } => unusable(format!(
                 "of camera {} are too few, or of too few receivers: without a quarter of the receivers, which is held \
@@ -304,13 +330,10 @@ impl SiteFit<'_> {
     fn observed(
         &self,
         upright: &[Option<UprightStarts>],
-        image_sizes: &[Option<ImageSize>],
-        fixes: &[SiteFix],
-        pairs: &[SitePair],
+        input: &SiteFitInput<'_>,
         run: &mut FitRun<'_>,
     ) -> Result<SiteMaps, SiteFitError> {
-        let input = SiteFitInput { image_sizes, fixes, pairs, correlation: RECEIVER_CORRELATION };
-        fit_site_observed(&input, upright, &mut || (run.observer)(FitEvent::Progress(&run.progress)))
+        fit_site_observed(input, upright, &mut || (run.observer)(FitEvent::Progress(&run.progress)))
     }
 
     /// Each camera on the fixes of the receivers that it sees; `None` where these are too few.
@@ -323,7 +346,21 @@ impl SiteFit<'_> {
         let of_camera = |(index, camera): (usize, &SiteCamera<'_>)| {
             let own: Vec<SiteFix> = fixes.iter().filter_map(|fix| fix.seen_by(index)).collect();
             let upright = self.upright_of(form).get(index).map_or(&[][..], std::slice::from_ref);
-            match self.observed(upright, &[camera.image_size], &own, &[], run) {
+            let known: Vec<SiteKnownPoint> = self
+                .known_points
+                .iter()
+                .filter(|point| point.camera == index)
+                .map(|point| SiteKnownPoint { camera: 0, ..*point })
+                .collect();
+            let image_sizes = [camera.image_size];
+            let input = SiteFitInput {
+                image_sizes: &image_sizes,
+                fixes: &own,
+                pairs: &[],
+                known_points: &known,
+                correlation: RECEIVER_CORRELATION,
+            };
+            match self.observed(upright, &input, run) {
                 Ok(maps) => Ok(Some(maps)),
                 Err(SiteFitError::Cancelled) => Err(FitError::Cancelled),
                 Err(_) => Ok(None),
@@ -444,7 +481,12 @@ impl SiteFit<'_> {
         let GaussMarkovNoise { variance_m2, correlation } = maps.receiver_noise();
         let stated_m2 = self.cameras[camera].gnss_bias_sigma_m.map(|sigma_m| sigma_m * sigma_m);
         let coloured_m2 = (1.0 - correlation.white_share) * variance_m2;
-        let shared_bias_m2 = stated_m2.unwrap_or(SHARED_BIAS_SHARE.powi(2) * coloured_m2);
+        let shared_bias_m2 = if self.known_points.is_empty() {
+            stated_m2.unwrap_or(SHARED_BIAS_SHARE.powi(2) * coloured_m2)
+        } else {
+            // The known points show it, and the error of the maps has what they leave of it.
+            0.0
+        };
         // The variance of the fixes is estimated from two axes of each receiver.
         let freedom = 2.0 * self.site.receivers.len() as f64;
         let foot_map = maps.foot_map(camera, shared_bias_m2, freedom).in_plane(&self.plane, &rows.plane);
@@ -457,6 +499,10 @@ impl SiteFit<'_> {
         set_uncalibrated(&mut parts, &Coverage::new(rows.rows.iter().map(|row| row.bounding_box)));
         set_image_size(&mut parts, self.cameras[camera].image_size);
         calibrate_reconstruction(&mut parts, &rows.rows)?;
+        let known_points = self.cameras[camera].known_points.len();
+        if known_points > 0 {
+            parts.set(KNOWN_POINTS, known_points as f64);
+        }
         parts.set("fix_scatter_m2", variance_m2);
         parts.set("fix_white_share", correlation.white_share);
         parts.set("fix_time_constant_s", correlation.time_constant_s);
@@ -492,7 +538,11 @@ impl SiteFit<'_> {
                 },
                 seed: self.seed,
                 epochs: EPOCHS,
-                training_rows_sha256: sha256_of(self.cameras[camera].samples, &[]),
+                training_rows_sha256: sha256_of(
+                    self.cameras[camera].samples,
+                    &[],
+                    self.cameras[camera].known_points,
+                ),
                 samples: rows.rows.len() as u32,
                 targets: rows.targets,
                 passes: rows.traverses,

@@ -1,6 +1,6 @@
 //! The context that all fits of a run share.
 
-use crate::domain::{GaussMarkovNoise, ImageSize};
+use crate::domain::{GaussMarkovNoise, ImageSize, KnownPoint};
 use crate::network::LossWeights;
 use crate::samples::unpaired::TargetBox;
 
@@ -16,6 +16,8 @@ pub(crate) struct FitContext<'a> {
     pub(crate) image_size: Option<ImageSize>,
     /// Boxes without a fix, in the order of target and time.
     pub(crate) unpaired: &'a [TargetBox],
+    /// Points of the ground whose place is known.
+    pub(crate) known_points: &'a [KnownPoint],
     /// Median height of the targets, m, and the standard deviation of its logarithm.
     pub(crate) target_height_m: (f64, f64),
     /// Noise of the fixes about the geometric map.

@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 
 use super::target_groups::groups_of_targets;
 use super::unpaired::TargetBox;
-use crate::domain::{BoundingBox, Error, ErrorKind, GaussMarkovNoise, Result, Sample};
+use crate::domain::{BoundingBox, Error, ErrorKind, GaussMarkovNoise, KnownPoint, Result, Sample};
 use crate::filters::{Traverse, smooth_traverse, tune_acceleration};
 use crate::geo::{EastNorth, LocalPlane, Position};
 use crate::statistics::{median, std_dev};
@@ -243,9 +243,9 @@ fn cut_near(times: &[f64], rank: usize, reach: usize) -> f64 {
     times[at]
 }
 
-/// SHA-256 of time, target, box and fix of each sample, then of target and box of each box without a fix, in
-/// their order, hexadecimal.
-pub(crate) fn sha256_of(samples: &[Sample], unpaired: &[TargetBox]) -> String {
+/// SHA-256 of time, target, box and fix of each sample, then of target and box of each box without a fix, then of the known
+/// points, in their order, hexadecimal.
+pub(crate) fn sha256_of(samples: &[Sample], unpaired: &[TargetBox], known: &[KnownPoint]) -> String {
     let mut hash = Sha256::new();
     for sample in samples {
         hash.update(sample.time.as_microsecond().to_le_bytes());
@@ -263,6 +263,14 @@ pub(crate) fn sha256_of(samples: &[Sample], unpaired: &[TargetBox]) -> String {
         hash.update(own.target.to_le_bytes());
         for side in own.bounding_box.sides_px() {
             hash.update(side.to_le_bytes());
+        }
+    }
+    for point in known {
+        let [x_px, y_px] = point.image_px;
+        let position = point.position;
+        let sigma_m = point.sigma_m.metres();
+        for value in [x_px, y_px, position.longitude_deg(), position.latitude_deg(), sigma_m] {
+            hash.update(value.to_le_bytes());
         }
     }
     hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()

@@ -68,7 +68,13 @@ pub(crate) fn fit_site_observed(
     let mut maps = initial_maps(input.image_sizes.len(), &receivers, &transfers)?;
     let mut geometries = upright_geometries(upright, &receivers, &mut maps);
     let noise = GaussMarkovNoise::new(FIRST_SIGMA_M, input.correlation);
-    let mut problem = LeastSquaresProblem::new(receivers, transfers, noise, FIRST_FOOT_SIGMA_PX);
+    let mut problem = LeastSquaresProblem::new(
+        receivers,
+        transfers,
+        input.known_points.to_vec(),
+        noise,
+        FIRST_FOOT_SIGMA_PX,
+    );
     problem.foot_priors = foot_priors(&mut geometries, &maps);
     let mut covariance = problem.solve(&mut maps, observer)?;
     let rounds = if geometries.iter().any(Option::is_some) { UPRIGHT_ROUNDS } else { ROUNDS };

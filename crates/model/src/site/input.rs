@@ -43,6 +43,19 @@ pub struct SitePair {
     pub boxes: [BoundingBox; 2],
 }
 
+/// A point of the ground whose place is known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SiteKnownPoint {
+    /// Index of the camera.
+    pub camera: usize,
+    /// Where it is in that camera's image, px.
+    pub image_px: [f64; 2],
+    /// Where it is in the site's plane, m.
+    pub position: EastNorth,
+    /// Error variance per axis of that position, m2.
+    pub variance_m2: f64,
+}
+
 /// Training rows of all cameras of a site.
 #[derive(Debug, Clone)]
 pub struct SiteFitInput<'a> {
@@ -52,6 +65,8 @@ pub struct SiteFitInput<'a> {
     pub fixes: &'a [SiteFix],
     /// Targets in two cameras at once.
     pub pairs: &'a [SitePair],
+    /// Known points of all cameras. With any, the error of each receiver has a lasting part, which they show.
+    pub known_points: &'a [SiteKnownPoint],
     /// Correlation over time of the receivers' errors to begin with; their variance and white share are estimated.
     pub correlation: NoiseCorrelation,
 }

@@ -3,6 +3,7 @@
 //! ```text
 //! cost = sum_receivers |W (z - mean_c f_c(box_c))|^2            fixes, whitened per receiver
 //!      + w sum_pairs rho(|f_b^-1(f_a(box_a)) - box_b|^2 / s^2)  feet carried from view a to view b, px
+//!      + sum_known rho(|z - f_c(foot)|^2 / s^2)                known points
 //!      + sum (p / sigma_prior)^2 + sum (p - p_0)' P (p - p_0)    weak prior; what the boxes' heights say, if asked
 //! ```
 //!
@@ -14,10 +15,13 @@ use std::ops::ControlFlow;
 use nalgebra::{DMatrix, DVector, Matrix2, SVector, Vector2};
 
 use super::ground_map::{GroundMap, GroundTangent, PARAMETERS};
-use super::input::SiteFitError;
+use super::input::{SiteFitError, SiteKnownPoint};
 use crate::domain::GaussMarkovNoise;
+use crate::geo::EastNorth;
 use crate::recipes::gaussian_process::projective_mean::Box4;
-use crate::recipes::gaussian_process::{Epoch, FootPrior, ReceiverNoise, ReceiverWhitener};
+use crate::recipes::gaussian_process::{
+    Epoch, FootPrior, POINTER_SIGMA_PX, ReceiverNoise, ReceiverWhitener, SESSION_SHARE,
+};
 
 /// Share of the transfers that counts as independent: a detector's error lasts for some frames.
 const INDEPENDENT_TRANSFERS: f64 = 0.25;
@@ -61,6 +65,8 @@ pub(super) struct LeastSquaresProblem {
     pub(super) foot_sigma_px: f64,
     /// Priors of each camera's parameters from the heights of boxes, if any.
     pub(super) foot_priors: Vec<Option<FootPrior>>,
+    /// Points whose place is known.
+    pub(super) known_points: Vec<SiteKnownPoint>,
     /// Noise of the fixes per axis, and the filters that whiten each receiver's.
     noise: GaussMarkovNoise,
     /// Variance per axis of the mean position of each row's feet, m2.
@@ -80,12 +86,23 @@ impl LeastSquaresProblem {
     pub(super) fn new(
         receivers: Vec<Vec<FixRow>>,
         transfers: Vec<Transfer>,
+        known_points: Vec<SiteKnownPoint>,
         noise: GaussMarkovNoise,
         foot_sigma_px: f64,
     ) -> Self {
         let foot_m2: Vec<Vec<f64>> = receivers.iter().map(|rows| vec![0.0; rows.len()]).collect();
-        let whiteners = whiteners(&receivers, &noise, &foot_m2);
-        Self { receivers, transfers, foot_sigma_px, foot_priors: Vec::new(), noise, foot_m2, whiteners }
+        let mut problem = Self {
+            receivers,
+            transfers,
+            foot_sigma_px,
+            foot_priors: Vec::new(),
+            known_points,
+            noise,
+            foot_m2,
+            whiteners: Vec::new(),
+        };
+        problem.set_noise(noise);
+        problem
     }
 
     pub(super) const fn noise(&self) -> GaussMarkovNoise {
@@ -93,8 +110,19 @@ impl LeastSquaresProblem {
     }
 
     pub(super) fn set_noise(&mut self, noise: GaussMarkovNoise) {
-        self.whiteners = whiteners(&self.receivers, &noise, &self.foot_m2);
+        self.whiteners = self.whiteners_of(&noise);
         self.noise = noise;
+    }
+
+    /// The filters that whiten the receivers' errors. Known points tell what lasts of an error; without any, every map has it
+    /// in common and it is stated beside the maps.
+    fn whiteners_of(&self, noise: &GaussMarkovNoise) -> Vec<ReceiverWhitener> {
+        let mut of_receiver = ReceiverNoise::of_gauss_markov(noise);
+        if !self.known_points.is_empty() {
+            of_receiver.session_m2 = SESSION_SHARE.powi(2) * noise.coloured_variance_m2();
+            of_receiver.session_time_s = f64::INFINITY;
+        }
+        whiteners(&self.receivers, &of_receiver, &self.foot_m2)
     }
 
     /// Takes the noise of the feet for a part of the noise of the rows, as large as the maps make it.
@@ -107,7 +135,7 @@ impl LeastSquaresProblem {
 
     /// Twice the negative log likelihood of the fixes' residuals under a noise of the receivers.
     pub(super) fn noise_misfit(&self, residuals: &[[Vec<f64>; 2]], noise: &GaussMarkovNoise) -> f64 {
-        let whiteners = whiteners(&self.receivers, noise, &self.foot_m2);
+        let whiteners = self.whiteners_of(noise);
         let log_determinants = 2.0 * whiteners.iter().map(|own| own.log_determinant).sum::<f64>();
         log_determinants + whitened_squares(residuals, &whiteners)
     }
@@ -182,6 +210,7 @@ impl LeastSquaresProblem {
             + transfers
             + prior_cost(maps)
             + self.foot_prior_cost(maps)
+            + self.known_points.iter().map(|point| KnownMisfit::new(maps, point).cost()).sum::<f64>()
     }
 
     fn foot_prior_cost(&self, maps: &[GroundMap]) -> f64 {
@@ -231,6 +260,9 @@ impl LeastSquaresProblem {
             if let Some(prior) = prior {
                 Self::add_foot_prior(prior, map, PARAMETERS * camera, &mut normal);
             }
+        }
+        for point in &self.known_points {
+            KnownMisfit::new(maps, point).add_to(point.camera, &mut normal);
         }
         for (rows, whitener) in self.receivers.iter().zip(&self.whiteners) {
             add_receiver(maps, rows, whitener, &mut normal);
@@ -321,13 +353,12 @@ fn dot(one: &[f64], other: &[f64]) -> f64 {
 
 fn whiteners(
     receivers: &[Vec<FixRow>],
-    noise: &GaussMarkovNoise,
+    noise: &ReceiverNoise,
     foot_m2: &[Vec<f64>],
 ) -> Vec<ReceiverWhitener> {
-    let noise = ReceiverNoise::of_gauss_markov(noise);
     let of_receiver = |(rows, foot_m2): (&Vec<FixRow>, &Vec<f64>)| {
         let epochs: Vec<Epoch> = rows.iter().map(|row| Epoch { time_s: row.time_s, sequence: 0 }).collect();
-        ReceiverWhitener::new(&epochs, &noise, foot_m2)
+        ReceiverWhitener::new(&epochs, noise, foot_m2)
     };
     receivers.iter().zip(foot_m2).map(of_receiver).collect()
 }
@@ -343,6 +374,47 @@ fn whitened_squares(residuals: &[[Vec<f64>; 2]], whiteners: &[ReceiverWhitener])
         residuals.iter().map(of_axis).sum()
     };
     residuals.iter().zip(whiteners).map(of_receiver).sum()
+}
+
+/// A known point less where a map has it.
+struct KnownMisfit {
+    tangent: GroundTangent,
+    apart_m: Vector2<f64>,
+    /// Variance per axis, m2.
+    variance_m2: f64,
+}
+
+impl KnownMisfit {
+    fn new(maps: &[GroundMap], point: &SiteKnownPoint) -> Self {
+        let [u_px, v_px] = point.image_px;
+        // The sides have no part in the map of a foot.
+        let tangent = maps[point.camera].tangent(&[u_px, v_px, 0.0, 0.0]);
+        let EastNorth { east_m, north_m } = point.position;
+        let pointer_m2 = 0.5 * POINTER_SIGMA_PX.powi(2) * tangent.by_foot.norm_squared();
+        Self {
+            apart_m: Vector2::new(east_m, north_m) - tangent.position,
+            variance_m2: point.variance_m2 + pointer_m2,
+            tangent,
+        }
+    }
+
+    fn squared(&self) -> f64 {
+        self.apart_m.norm_squared() / self.variance_m2
+    }
+
+    fn cost(&self) -> f64 {
+        CAUCHY_SCALE.powi(2) * (self.squared() / CAUCHY_SCALE.powi(2)).ln_1p()
+    }
+
+    fn add_to(&self, camera: usize, normal: &mut NormalEquations) {
+        let weight = 1.0 / (1.0 + self.squared() / CAUCHY_SCALE.powi(2)) / self.variance_m2;
+        let [east, north] = self.tangent.by_parameters;
+        let right: [f64; PARAMETERS] =
+            std::array::from_fn(|at| weight * (east[at] * self.apart_m[0] + north[at] * self.apart_m[1]));
+        normal.add(&[camera], &right, |row, column| {
+            weight * (east[row] * east[column] + north[row] * north[column])
+        });
+    }
 }
 
 /// A foot carried from one view into another.

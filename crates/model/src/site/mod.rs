@@ -18,7 +18,7 @@ mod tests;
 
 pub use fit::fit_site;
 pub(crate) use fit::fit_site_observed;
-pub use input::{RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SitePair};
+pub use input::{RECEIVER_CORRELATION, SiteFitError, SiteFitInput, SiteFix, SiteKnownPoint, SitePair};
 pub use maps::{SiteMaps, SitePosition};
 pub use rows::box_at;
 pub(crate) use stored::JointMap;

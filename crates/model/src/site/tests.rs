@@ -72,9 +72,18 @@ fn world_with(seed: u64, lasting_sigma_px: f64) -> World {
 }
 
 fn fitted(world: &World, pairs: &[SitePair]) -> SiteMaps {
+    fitted_with(world, pairs, &[])
+}
+
+fn fitted_with(world: &World, pairs: &[SitePair], known_points: &[SiteKnownPoint]) -> SiteMaps {
     let size = Some(ImageSize::new(1280, 720).expect("valid"));
-    let input =
-        SiteFitInput { image_sizes: &[size, size], fixes: &world.fixes, pairs, correlation: CORRELATION };
+    let input = SiteFitInput {
+        image_sizes: &[size, size],
+        fixes: &world.fixes,
+        pairs,
+        known_points,
+        correlation: CORRELATION,
+    };
     fit_site(&input).expect("a solution")
 }
 
@@ -160,8 +169,13 @@ fn a_camera_without_fixes_is_fitted_by_its_neighbour() {
     let maps = fitted(&one_sided, &one_sided.pairs);
     assert!(disagreement_m(&maps, &one_sided) < 0.5);
     let size = [None, None];
-    let input =
-        SiteFitInput { image_sizes: &size, fixes: &one_sided.fixes, pairs: &[], correlation: CORRELATION };
+    let input = SiteFitInput {
+        image_sizes: &size,
+        fixes: &one_sided.fixes,
+        pairs: &[],
+        known_points: &[],
+        correlation: CORRELATION,
+    };
     assert_eq!(fit_site(&input).err(), Some(SiteFitError::TooFewRows { camera: 1 }));
 }
 
@@ -187,4 +201,39 @@ fn the_noise_of_the_feet_does_not_bend_the_maps() {
     println!("{mean_m:.3} m");
     // Without the noise of the feet the mean is 0.33 m.
     assert!(mean_m < 0.2, "{mean_m}");
+}
+
+/// What all receivers have in common is seen by four known points of one camera, in both cameras.
+#[test]
+fn known_points_of_one_camera_take_the_bias_away_from_both() {
+    let bias = EastNorth { east_m: 2.0, north_m: -1.5 };
+    let (mut without_m, mut with_m, mut wrong_m) = (0.0, 0.0, 0.0);
+    for seed in 1..=4 {
+        let mut world = world(seed);
+        for fix in &mut world.fixes {
+            fix.position.east_m += bias.east_m;
+            fix.position.north_m += bias.north_m;
+        }
+        let error_m = |maps: &SiteMaps| {
+            let apart = |(camera, own, truth): &(usize, BoundingBox, EastNorth)| {
+                maps.locate(*camera, own).position.distance_m(*truth)
+            };
+            world.boxes.iter().map(apart).sum::<f64>() / world.boxes.len() as f64 / 4.0
+        };
+        let of_first: Vec<_> = world.boxes.iter().filter(|(camera, ..)| *camera == 0).collect();
+        let point = |(_, _, truth): &&(usize, BoundingBox, EastNorth)| SiteKnownPoint {
+            camera: 0,
+            image_px: foot_px(0.0, *truth),
+            position: *truth,
+            variance_m2: 0.04,
+        };
+        let mut points: Vec<SiteKnownPoint> =
+            of_first.iter().step_by(of_first.len() / 6).map(point).collect();
+        without_m += error_m(&fitted(&world, &world.pairs));
+        with_m += error_m(&fitted_with(&world, &world.pairs, &points));
+        points[0].position.east_m += 40.0;
+        wrong_m += error_m(&fitted_with(&world, &world.pairs, &points));
+    }
+    println!("{without_m:.2} m, with known points {with_m:.2} m, one of them wrong {wrong_m:.2} m");
+    assert!(with_m < 0.5 * without_m && wrong_m < 0.6 * without_m, "{without_m} {with_m} {wrong_m}");
 }

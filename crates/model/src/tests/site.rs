@@ -63,6 +63,7 @@ fn cameras<'a>(site: &SimulatedSite, samples: &'a [Vec<Sample>]) -> Vec<SiteCame
         image_size: Some(site.image_size),
         gnss_error: GnssError::Unknown,
         gnss_bias_sigma_m: None,
+        known_points: &[],
     };
     ["c1", "c2"].into_iter().zip(samples).map(camera).collect()
 }

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::domain::{
     Camera, CameraId, CameraKey, CameraMoved, ClockOffset, Error, ErrorKind, ExpectedVersion, GnssBiasSigma,
-    GnssError, ImageSize, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision, SampleCount, SigmaM,
-    SiteId, SnapshotSource, TargetClass, TargetId,
+    GnssError, ImageSize, KnownPoint, NewCamera, Receiver, ReceiverId, Receivers, Result, Revision,
+    SampleCount, SigmaM, SiteId, SnapshotSource, TargetClass, TargetId,
 };
 use crate::geo::Position;
 use crate::refusals::unknown_site;
@@ -119,6 +119,17 @@ struct StoredProfile {
     retrain_when_moved: bool,
     snapshot: Option<StoredSnapshot>,
     history: Option<StoredHistory>,
+    #[serde(default)]
+    known_points: Vec<StoredKnownPoint>,
+}
+
+/// A known point as it is stored.
+#[derive(Serialize, Deserialize)]
+struct StoredKnownPoint {
+    image_px: [f64; 2],
+    /// Longitude and latitude.
+    position_deg: (f64, f64),
+    sigma_m: f64,
 }
 
 /// Where a still picture is fetched, as it is stored.
@@ -165,6 +176,7 @@ pub(crate) fn write_profile(profile: &NewCamera) -> Result<String> {
             password: source.password().map(str::to_owned),
         }),
         history: profile.history.map(StoredHistory::from),
+        known_points: profile.known_points.iter().map(StoredKnownPoint::from).collect(),
     };
     serde_json::to_string(&stored).map_err(Error::fault)
 }
@@ -192,8 +204,30 @@ fn read_profile(json: &str, id: CameraId) -> Result<NewCamera> {
         retrain_when_moved: stored.retrain_when_moved,
         snapshot: snapshot.transpose()?,
         history: stored.history.as_ref().map(StoredHistory::to_domain).transpose()?,
+        known_points: stored.known_points.iter().map(StoredKnownPoint::to_domain).collect::<Result<_>>()?,
         ..NewCamera::named(id)
     })
+}
+
+impl From<&KnownPoint> for StoredKnownPoint {
+    fn from(point: &KnownPoint) -> Self {
+        Self {
+            image_px: point.image_px,
+            position_deg: (point.position.longitude_deg(), point.position.latitude_deg()),
+            sigma_m: point.sigma_m.metres(),
+        }
+    }
+}
+
+impl StoredKnownPoint {
+    fn to_domain(&self) -> Result<KnownPoint> {
+        let (longitude, latitude) = self.position_deg;
+        Ok(KnownPoint {
+            image_px: self.image_px,
+            position: Position::new(longitude, latitude).map_err(Error::fault)?,
+            sigma_m: SigmaM::new(self.sigma_m)?,
+        })
+    }
 }
 
 impl StoredReceiver {

@@ -2,8 +2,8 @@ use std::collections::BTreeMap;
 
 use super::*;
 use crate::domain::{
-    Camera, ClockOffset, GnssBiasSigma, GnssError, HistorySettings, ImageSize, Receiver, ReceiverId,
-    Receivers, Revision, SampleCount, SigmaM, SnapshotSource, TargetClass,
+    Camera, ClockOffset, GnssBiasSigma, GnssError, HistorySettings, ImageSize, KnownPoint, Receiver,
+    ReceiverId, Receivers, Revision, SampleCount, SigmaM, SnapshotSource, TargetClass,
 };
 use crate::{CameraVersion, ChangeMark, SampleFilter};
 
@@ -40,6 +40,11 @@ fn full(name: &str) -> NewCamera {
                 .expect("an address"),
         ),
         history: Some(HistorySettings::new(7, 5_000_000, 2.5).expect("in range")),
+        known_points: vec![KnownPoint {
+            image_px: [512.25, 640.0],
+            position: Position::new(103.98679, -30.6280135).expect("a position"),
+            sigma_m: SigmaM::new(0.2).expect("a sigma"),
+        }],
     }
 }
 

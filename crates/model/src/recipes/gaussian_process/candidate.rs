@@ -4,9 +4,12 @@ use nalgebra::{DMatrix, DVector, SVector};
 
 use super::edge_noise::{by_edge, position_noise_m2};
 use super::groups::Grouping;
-use super::hyperparameters::{Hyperparameters, LikelihoodRows, Priors, join, kernel_columns};
+use super::hyperparameters::{
+    Hyperparameters, LikelihoodPoints, LikelihoodRows, Priors, join, kernel_columns,
+};
 use super::kernel::inducing_points;
-use super::map_rows::MapRows;
+use super::known_rows::KnownRows;
+use super::map_rows::{Evidence, MapRows};
 use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use super::posterior::{Gram, Posterior, TangentPrior};
 use super::projective_mean::{Box4, COEFFICIENTS, FOOT_COEFFICIENTS, ProjectiveMean};
@@ -56,6 +59,9 @@ pub(crate) struct Draft<'a> {
     pub(crate) edge_px2: &'a [f64; 16],
     pub(crate) mean: ProjectiveMean,
     pub(crate) inflation_m2: Vec<f64>,
+    /// Points whose place is known, and what gross errors have cost each of them, m2.
+    pub(crate) known: &'a KnownRows,
+    pub(crate) known_inflation_m2: Vec<f64>,
     /// The camera whose geometry is the foot's prior, and where it is linearised.
     pub(crate) upright: Option<(&'a UprightCamera, Parameters)>,
 }
@@ -105,9 +111,8 @@ impl<'a> Draft<'a> {
             let mut draft = Draft { form: MapForm::Upright, upright: Some((camera, placed)), ..self.clone() };
             draft.set_coefficients(&camera.coefficients(&placed, &self.mean)?)?;
             draft.relinearize(parameters)?;
-            let columns = draft.columns(&[], parameters)?;
-            let all: Vec<usize> = (0..self.inputs.len()).collect();
-            let gram = columns.gram(&all, &self.rows.epochs, parameters, &draft.white_m2());
+            let columns = draft.columns(draft.evidence(), &[], parameters)?;
+            let gram = draft.gram(&columns, &[], parameters)?;
             let at = draft.upright.as_ref()?.1;
             let score = gram.misfit_at(&DVector::from_column_slice(&draft.mean.coefficients))
                 + 2.0 * camera.evidence(&at)?.misfit;
@@ -177,8 +182,20 @@ impl<'a> Draft<'a> {
             labels_m: &labels_m,
             white_m2: &white_m2,
             mean: &self.mean,
+            known: self.likelihood_points(),
         }
         .maximize(start, priors, noise_frozen)
+    }
+
+    fn likelihood_points(&self) -> LikelihoodPoints<'a> {
+        let (tangent, labels_m) = linearize(&self.known.rows, &self.mean);
+        LikelihoodPoints { points: self.known, tangent, labels_m, variances_m2: self.known_m2() }
+    }
+
+    /// The variance of each known point, m2.
+    fn known_m2(&self) -> Vec<f64> {
+        let own_m2 = self.known.noise_m2(&self.mean);
+        own_m2.iter().zip(&self.known_inflation_m2).map(|(own, inflation)| own + inflation).collect()
     }
 
     /// Variance per axis of each row's position by the noise of its box: the box is an input with errors (the effective
@@ -205,41 +222,71 @@ impl<'a> Draft<'a> {
         Some(prior.with_foot(&mean, &precision))
     }
 
-    fn columns(&self, inducing: &[[f64; 4]], parameters: &Hyperparameters) -> Option<Columns> {
-        let (tangent, labels_m) = linearize(self.rows, &self.mean);
+    fn evidence(&self) -> Evidence<'a> {
+        Evidence { rows: self.rows, inputs: self.inputs }
+    }
+
+    fn columns(
+        &self,
+        Evidence { rows, inputs }: Evidence<'_>,
+        inducing: &[[f64; 4]],
+        parameters: &Hyperparameters,
+    ) -> Option<Columns> {
+        let (tangent, labels_m) = linearize(rows, &self.mean);
         let (phi, left_out_m2) = match self.form {
             MapForm::Homography | MapForm::Upright => {
-                (DMatrix::zeros(self.inputs.len(), 0), vec![0.0; self.inputs.len()])
+                (DMatrix::zeros(inputs.len(), 0), vec![0.0; inputs.len()])
             }
-            MapForm::Residual => kernel_columns(self.inputs, inducing, parameters)?,
+            MapForm::Residual => kernel_columns(inputs, inducing, parameters)?,
         };
         Some(Columns { tangent, labels_m, phi, left_out_m2 })
+    }
+
+    /// Gram matrix of all rows and of the known points.
+    fn gram(&self, columns: &Columns, inducing: &[[f64; 4]], parameters: &Hyperparameters) -> Option<Gram> {
+        let all: Vec<usize> = (0..self.inputs.len()).collect();
+        let of_rows = columns.gram(&all, &self.rows.epochs, parameters, &self.white_m2());
+        self.with_known(of_rows, inducing, parameters)
+    }
+
+    /// The Gram matrix of rows with that of the known points added.
+    fn with_known(&self, of_rows: Gram, inducing: &[[f64; 4]], parameters: &Hyperparameters) -> Option<Gram> {
+        if self.known.is_empty() {
+            return Some(of_rows);
+        }
+        let columns = self.columns(self.known.evidence(), inducing, parameters)?;
+        let variances_m2: Vec<f64> =
+            self.known_m2().iter().zip(&columns.left_out_m2).map(|(own, left_out)| own + left_out).collect();
+        Some(of_rows.plus(&Gram::new(columns.joined(), &self.known.whitener(&variances_m2))))
     }
 
     /// Gauss-Newton steps of the mean, with the weights of rows in gross error found again.
     pub(crate) fn relinearize(&mut self, parameters: &Hyperparameters) -> Option<()> {
         let inducing = self.inducing(MAX_INDUCING);
         for _ in 0..self.form.relinearizations() {
-            let columns = self.columns(&inducing, parameters)?;
-            let all: Vec<usize> = (0..self.inputs.len()).collect();
-            let gram = columns.gram(&all, &self.rows.epochs, parameters, &self.white_m2());
+            let columns = self.columns(self.evidence(), &inducing, parameters)?;
+            let gram = self.gram(&columns, &inducing, parameters)?;
             let posterior = Posterior::new(&gram, &self.prior(parameters)?)?;
+            let kernel_m =
+                |columns: &Columns| posterior.kernel.each_ref().map(|weights| &columns.phi * weights);
+            let of_rows = kernel_m(&columns);
+            let of_known = kernel_m(&self.columns(self.known.evidence(), &inducing, parameters)?);
             self.move_to(&posterior.tangent)?;
-            let kernel_m = posterior.kernel.each_ref().map(|weights| &columns.phi * weights);
-            let residuals_m: Vec<[f64; 2]> = self
-                .rows
-                .misses_m(&self.mean)
-                .iter()
-                .enumerate()
-                .map(|(row, miss_m)| [miss_m[0] - kernel_m[0][row], miss_m[1] - kernel_m[1][row]])
-                .collect();
+            let residuals_m = less_kernel(&self.rows.misses_m(&self.mean), &of_rows);
             let of_box = self.box_noise_m2();
             let whitener = ReceiverWhitener::new(&self.rows.epochs, &parameters.noise, &self.white_m2());
             let inflation_m2 = whitener.inflation_m2(&residuals_m);
             self.inflation_m2 =
                 inflation_m2.iter().zip(&of_box).map(|(all, of_box)| (all - of_box).max(0.0)).collect();
+            self.known_inflation_m2 = self.known_inflation_m2(&of_known);
         }
         Some(())
+    }
+
+    /// Extra variance of known points that the map contradicts, m2: a wrong one must not bend it.
+    fn known_inflation_m2(&self, kernel_m: &[DVector<f64>; 2]) -> Vec<f64> {
+        let residuals_m = less_kernel(&self.known.rows.misses_m(&self.mean), kernel_m);
+        self.known.inflation_m2(&self.mean, &residuals_m, &self.known.noise_m2(&self.mean))
     }
 
     /// The posterior of all rows and without each group.
@@ -248,14 +295,16 @@ impl<'a> Draft<'a> {
     /// groups of their own, each is whitened on its own.
     pub(crate) fn solve(self, parameters: &Hyperparameters, grouping: &Grouping) -> Option<MapCandidate> {
         let inducing = self.inducing(MAX_INDUCING);
-        let columns = self.columns(&inducing, parameters)?;
+        let columns = self.columns(self.evidence(), &inducing, parameters)?;
         let prior = self.prior(parameters)?;
         let white_m2 = self.white_m2();
         let of = |rows: &[usize]| columns.gram(rows, &self.rows.epochs, parameters, &white_m2);
-        let total = of(&(0..self.inputs.len()).collect::<Vec<_>>());
+        let total =
+            self.with_known(of(&(0..self.inputs.len()).collect::<Vec<_>>()), &inducing, parameters)?;
         let posterior = Posterior::new(&total, &prior)?;
         let groups: Vec<Gram> = grouping.members().iter().map(|rows| of(rows)).collect();
         let sum = groups.iter().cloned().reduce(|sum, own| sum.plus(&own))?;
+        let sum = self.with_known(sum, &inducing, parameters)?;
         let without =
             groups.iter().map(|own| Posterior::new(&sum.minus(own), &prior)).collect::<Option<_>>()?;
         let Self { form, mean, .. } = self;
@@ -273,11 +322,16 @@ impl<'a> Draft<'a> {
 }
 
 impl Columns {
+    /// All columns side by side, as a Gram matrix takes them.
+    fn joined(&self) -> DMatrix<f64> {
+        join(&[&self.tangent, &self.phi, &self.labels_m])
+    }
+
     /// Gram matrix of some rows, in their order.
     fn gram(&self, rows: &[usize], epochs: &[Epoch], parameters: &Hyperparameters, white_m2: &[f64]) -> Gram {
         let own: Vec<Epoch> = rows.iter().map(|row| epochs[*row]).collect();
         let variances: Vec<f64> = rows.iter().map(|row| self.left_out_m2[*row] + white_m2[*row]).collect();
-        let columns = join(&[&self.tangent, &self.phi, &self.labels_m]);
+        let columns = self.joined();
         let columns = if rows.len() == epochs.len() { columns } else { columns.select_rows(rows) };
         Gram::new(columns, &ReceiverWhitener::new(&own, &parameters.noise, &variances))
     }
@@ -346,6 +400,12 @@ impl MapCandidate {
         }
         (1.0 - posterior_m2 / f64::max(jackknife_m2, 1e-12)).max(0.0)
     }
+}
+
+/// What a mean misses less what the kernel says of it, m.
+fn less_kernel(misses_m: &[[f64; 2]], kernel_m: &[DVector<f64>; 2]) -> Vec<[f64; 2]> {
+    let own = |(row, miss_m): (usize, &[f64; 2])| [0, 1].map(|axis| miss_m[axis] - kernel_m[axis][row]);
+    misses_m.iter().enumerate().map(own).collect()
 }
 
 /// Tangent columns of both axes, and fixes less what the tangent does not explain, m.

@@ -6,8 +6,9 @@ use super::edge_noise::edge_covariance_px2;
 use super::groups::{Grouping, groups};
 use super::hyperparameters::{Hyperparameters, Priors};
 use super::kernel::InputScales;
+use super::known_rows::{KnownFoot, KnownRows};
 use super::leave_out::{bounded_m2, calibrate, weigh};
-use super::map_rows::{MapRows, scatter_m2};
+use super::map_rows::{Evidence, MapRows, scatter_m2};
 use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use super::predictor::{PositionMap, Predictor, Stated};
 use super::projective_mean::{Box4, ProjectiveMean};
@@ -50,6 +51,8 @@ pub(crate) struct FitReport {
     pub(crate) groups: usize,
     /// Per candidate: name, weight, and mean squared miss per axis to left-out fixes, m2.
     pub(crate) candidates: Vec<(&'static str, f64, f64)>,
+    /// How far the map is from each known point, and the standard deviation of that, m.
+    pub(crate) known_m: Vec<(f64, f64)>,
     /// Factor on the map's variance by left-out targets.
     pub(crate) widening: f64,
     /// How sessions differ, if there are several.
@@ -80,22 +83,28 @@ pub(crate) struct FitSettings {
     pub(crate) seed: u64,
     /// Geometry by the heights of boxes, if the image size is known.
     pub(crate) upright: Option<UprightCamera>,
+    /// Points of the ground whose place is known.
+    pub(crate) known: Vec<KnownFoot>,
 }
 
 /// Fits a model; `None` where the rows determine nothing (not finite, or all alike).
 pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, FitReport)> {
     let thinned = all.thinned(MAX_ROWS);
     let mut mean = ProjectiveMean::of_rows(&thinned.boxes, &thinned.labels_m);
-    mean.fit_foot(&thinned.boxes, &thinned.labels_m);
+    let known = KnownRows::new(&settings.known, &thinned);
+    let start = known.beside(&thinned);
+    mean.fit_foot(&start.boxes, &start.labels_m);
     mean.coefficients.iter().all(|value| value.is_finite()).then_some(())?;
     let rows = thinned.without_gross_errors(&mean);
     let input_scales = InputScales::of_rows(&rows.boxes);
     let inputs: Vec<[f64; 4]> = rows.boxes.iter().map(|sides| input_scales.input(sides)).collect();
     let grouping = groups(&rows.epochs);
     let edge_px2 = edge_covariance_px2(&all.epochs, &all.boxes);
-    let bias = BiasPrior::new(&rows.epochs, settings.bias_sigma_m);
+    let known = known.with_inputs(&input_scales);
+    let bias = BiasPrior::new(&rows.epochs, settings.bias_sigma_m, !known.is_empty());
+    let evidence = Evidence { rows: &rows, inputs: &inputs };
     let Solutions { parameters, receiver, candidates } =
-        solve(&rows, &inputs, mean, &edge_px2, settings, &bias, &grouping)?;
+        solve(evidence, &known, mean, &edge_px2, settings, &bias, &grouping)?;
 
     let (weights, misses_m2) = weigh(&candidates, &grouping, &rows, &parameters.noise, settings.seed);
     let kept = without_negligible(&weights);
@@ -117,7 +126,9 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
     let mut predictor = Predictor::new(maps, input_scales, stated);
     let extra_m2 = |row: usize| predictor.jackknife_m2(&rows.boxes[row]);
     let calibration = calibrate(&candidates, &kept, &grouping, &rows, &parameters.noise, &extra_m2);
-    predictor.widening = calibration.widening;
+    // Known points show a receiver's bias in all parts of its session alike, so these parts are one value of it, not several.
+    let is_judged = known.is_empty() || !cuts_sessions(&grouping, &rows.epochs);
+    predictor.widening = if is_judged { calibration.widening } else { 1.0 };
     let residuals_m: Vec<[f64; 2]> =
         (0..rows.boxes.len()).map(|row| mixed_residual(&candidates, &kept, row)).collect();
     let receiver_m2 = parameters.noise.variance_m2();
@@ -134,7 +145,8 @@ pub(crate) fn fit(all: &MapRows, settings: &FitSettings) -> Option<(Predictor, F
         gross_errors: thinned.boxes.len() - rows.boxes.len(),
         groups: grouping.members().len(),
         candidates: candidates.iter().zip(&weights).zip(&misses_m2).map(of_candidate).collect(),
-        widening: calibration.widening,
+        known_m: known_misses_m(&predictor, &known),
+        widening: predictor.widening,
         sessions: SessionBiases::new(&rows.epochs, &residuals_m, &parameters.noise),
         jackknife_shares: jackknives.iter().map(|(share, _)| *share).collect(),
         freedom,
@@ -156,8 +168,8 @@ struct Solutions {
 
 /// Estimates the hyper-parameters and solves every form of the map.
 fn solve(
-    rows: &MapRows,
-    inputs: &[[f64; 4]],
+    Evidence { rows, inputs }: Evidence<'_>,
+    known: &KnownRows,
     mean: ProjectiveMean,
     edge_px2: &[f64; 16],
     settings: &FitSettings,
@@ -169,8 +181,17 @@ fn solve(
     let white =
         ReceiverWhitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
     let inflation_m2 = white.inflation_m2(&residuals_m);
-    let mut residual =
-        Draft { form: MapForm::Residual, rows, inputs, edge_px2, mean, inflation_m2, upright: None };
+    let mut residual = Draft {
+        form: MapForm::Residual,
+        rows,
+        inputs,
+        edge_px2,
+        known_inflation_m2: known.first_inflation_m2(&mean, scatter_m2),
+        mean,
+        inflation_m2,
+        known,
+        upright: None,
+    };
     let mut homography = Draft { form: MapForm::Homography, ..residual.clone() };
     let spread_m = residual.mean.spread_m;
     let mut priors = priors(rows, scatter_m2, spread_m, settings);
@@ -235,6 +256,18 @@ pub(super) fn own_miss_m2(predictor: &Predictor, rows: &MapRows, receiver_m2: f6
     sum_m2 / rows.boxes.len() as f64
 }
 
+/// How far a model's answers are from each known point, and the standard deviation of that, m.
+fn known_misses_m(predictor: &Predictor, known: &KnownRows) -> Vec<(f64, f64)> {
+    let of_point = |((sides, label_m), own_m2): ((&Box4, &[f64; 2]), f64)| {
+        let answer = predictor.mix(sides, true);
+        let [east_m, north_m] = answer.position_m;
+        let [east_m2, _, north_m2] = answer.map_m2;
+        let apart_m = (label_m[0] - east_m).hypot(label_m[1] - north_m);
+        (apart_m, (0.5 * (east_m2 + north_m2) + own_m2).sqrt())
+    };
+    known.rows.boxes.iter().zip(&known.rows.labels_m).zip(known.variances_m2()).map(of_point).collect()
+}
+
 fn mixed_residual(candidates: &[MapCandidate], weights: &[f64], row: usize) -> [f64; 2] {
     let mut sum_m = [0.0; 2];
     for (candidate, weight) in candidates.iter().zip(weights).filter(|(_, weight)| **weight > 0.0) {
@@ -250,18 +283,22 @@ fn mixed_residual(candidates: &[MapCandidate], weights: &[f64], row: usize) -> [
 enum BiasPrior {
     /// Nothing: a share of the coloured part of the receivers' error.
     Unknown,
+    /// Nothing, but known points show that of every receiver.
+    Shown,
     /// That of several receivers or sessions, m per axis: it is added to the error of the map.
     Common { sigma_m: f64 },
-    /// That of the only receiver in its only session, m per axis: it replaces the prior of the slow part.
+    /// That of a receiver in its session, m per axis: it replaces the prior of the slow part.
     OfSession { sigma_m: f64 },
 }
 
 impl BiasPrior {
-    fn new(epochs: &[Epoch], stated_sigma_m: Option<f64>) -> Self {
+    fn new(epochs: &[Epoch], stated_sigma_m: Option<f64>, has_known_points: bool) -> Self {
+        let is_of_session = has_known_points || sessions_of_receivers(epochs).count() == 1;
         match stated_sigma_m {
-            None => Self::Unknown,
-            Some(sigma_m) if sessions_of_receivers(epochs).count() == 1 => Self::OfSession { sigma_m },
+            Some(sigma_m) if is_of_session => Self::OfSession { sigma_m },
             Some(sigma_m) => Self::Common { sigma_m },
+            None if has_known_points => Self::Shown,
+            None => Self::Unknown,
         }
     }
 
@@ -270,7 +307,7 @@ impl BiasPrior {
         match self {
             Self::Unknown => SHARED_BIAS_SHARE.powi(2) * (receiver.short_m2 + receiver.session_m2),
             Self::Common { sigma_m } => sigma_m * sigma_m,
-            Self::OfSession { .. } => 0.0,
+            Self::Shown | Self::OfSession { .. } => 0.0,
         }
     }
 }
@@ -278,6 +315,16 @@ impl BiasPrior {
 /// Rows of each receiver in each of its sessions.
 fn sessions_of_receivers(epochs: &[Epoch]) -> impl Iterator<Item = &[Epoch]> {
     epochs.chunk_by(|one, next| one.sequence == next.sequence && next.time_s - one.time_s <= SESSION_GAP_S)
+}
+
+/// True if some rows of a receiver's session are left out together without the others.
+fn cuts_sessions(grouping: &Grouping, epochs: &[Epoch]) -> bool {
+    let mut from = 0;
+    sessions_of_receivers(epochs).any(|session| {
+        let rows = from..from + session.len();
+        from = rows.end;
+        grouping.cuts(rows)
+    })
 }
 
 /// Median interval between neighbouring rows of a receiver, s; 0 where there are none.
@@ -299,13 +346,13 @@ fn independent_biases(epochs: &[Epoch], noise: &ReceiverNoise) -> f64 {
 
 /// Degrees of freedom of the stated variance, by Welch and Satterthwaite: what differs between receivers and
 /// sessions has those of its prior and two per independent bias beyond the first, what differs within them
-/// two per independent fix. A stated bias is known, not estimated.
+/// two per independent fix. A bias that is stated, or that known points show, is known, not estimated.
 fn degrees_of_freedom(epochs: &[Epoch], noise: &ReceiverNoise, bias: &BiasPrior) -> f64 {
     let within = ReceiverNoise { session_m2: 0.0, ..*noise };
     let (of_all, of_within) = (information(epochs, noise), information(epochs, &within));
     let between_share = (1.0 - of_all / of_within).clamp(0.0, 1.0);
     let between = match bias {
-        BiasPrior::OfSession { .. } => f64::INFINITY,
+        BiasPrior::Shown | BiasPrior::OfSession { .. } => f64::INFINITY,
         _ => PRIOR_FREEDOM + 2.0 * (independent_biases(epochs, noise) - 1.0),
     };
     let within = 2.0 * (within.variance_m2() * of_within - 1.0).max(2.0);

@@ -25,6 +25,11 @@ impl Grouping {
         members.retain(|rows| !rows.is_empty());
         members
     }
+
+    /// True if some of these neighbouring rows are left out together without the others.
+    pub(crate) fn cuts(&self, rows: std::ops::Range<usize>) -> bool {
+        self.of_row[rows].windows(2).any(|pair| pair[0] != pair[1])
+    }
 }
 
 /// Groups of rows that stand in the order of target and time.

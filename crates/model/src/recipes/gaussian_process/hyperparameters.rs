@@ -4,6 +4,7 @@
 use nalgebra::{DMatrix, SMatrix, SVector};
 
 use super::kernel::LengthScales;
+use super::known_rows::KnownRows;
 use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use super::posterior::{Gram, Posterior, TangentPrior};
 use super::projective_mean::ProjectiveMean;
@@ -17,7 +18,7 @@ const NOISE: usize = 5;
 /// likelihood alone trusts differences between neighbours to centimetres and bends the map after them.
 const MIN_WHITE_SHARE: f64 = 0.3;
 /// Median of the slow part's standard deviation, as a share of the short one's.
-const SESSION_SHARE: f64 = 0.5;
+pub(crate) const SESSION_SHARE: f64 = 0.5;
 /// Range of the white share that the priors are built on: an estimate is never exactly 0 or 1.
 const WHITE_SHARES: [f64; 2] = [0.02, 0.999];
 /// Standard deviation of the logarithm of a slow part that is stated from outside.
@@ -171,6 +172,29 @@ pub(crate) struct LikelihoodRows<'a> {
     /// White variance per row beside the receiver's, m2.
     pub(crate) white_m2: &'a [f64],
     pub(crate) mean: &'a ProjectiveMean,
+    pub(crate) known: LikelihoodPoints<'a>,
+}
+
+/// Known points, linearised: they tell the bias of the receivers.
+#[derive(Debug)]
+pub(crate) struct LikelihoodPoints<'a> {
+    pub(crate) points: &'a KnownRows,
+    pub(crate) tangent: DMatrix<f64>,
+    pub(crate) labels_m: DMatrix<f64>,
+    /// Variance of each, m2.
+    pub(crate) variances_m2: Vec<f64>,
+}
+
+impl LikelihoodPoints<'_> {
+    /// As that of the rows.
+    fn gram(&self, inducing: &[[f64; 4]], parameters: &Hyperparameters) -> Option<(Gram, f64)> {
+        let (phi, left_out_m2) = kernel_columns(&self.points.inputs, inducing, parameters)?;
+        let variances_m2: Vec<f64> =
+            left_out_m2.iter().zip(&self.variances_m2).map(|(left_out, own)| left_out + own).collect();
+        let whitener = self.points.whitener(&variances_m2);
+        let gram = Gram::new(join(&[&self.tangent, &phi, &self.labels_m]), &whitener);
+        Some((gram, 2.0 * whitener.log_determinant))
+    }
 }
 
 impl LikelihoodRows<'_> {
@@ -185,8 +209,13 @@ impl LikelihoodRows<'_> {
         let variances: Vec<f64> =
             left_out_m2.iter().zip(self.white_m2).map(|(left_out, white)| left_out + white).collect();
         let whitener = ReceiverWhitener::new(self.epochs, &parameters.noise, &variances);
-        let columns = join(&[self.tangent, &phi, self.labels_m]);
-        Some((Gram::new(columns, &whitener), 2.0 * whitener.log_determinant))
+        let gram = Gram::new(join(&[self.tangent, &phi, self.labels_m]), &whitener);
+        let log_determinant = 2.0 * whitener.log_determinant;
+        if self.known.points.is_empty() {
+            return Some((gram, log_determinant));
+        }
+        let (of_known, log_determinant_of_known) = self.known.gram(self.inducing, parameters)?;
+        Some((gram.plus(&of_known), log_determinant + log_determinant_of_known))
     }
 
     /// Minus twice the logarithm of the marginal likelihood; infinite where it cannot be computed.

@@ -18,6 +18,13 @@ pub(crate) struct MapRows {
     pub(crate) labels_m: Vec<[f64; 2]>,
 }
 
+/// Rows, and their boxes as the kernel takes them.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Evidence<'a> {
+    pub(crate) rows: &'a MapRows,
+    pub(crate) inputs: &'a [[f64; 4]],
+}
+
 impl MapRows {
     pub(crate) fn picked(&self, rows: &[usize]) -> Self {
         Self {

@@ -2,7 +2,7 @@
 //! receiver, whose stated error counts receivers, not rows.
 //!
 //! `docs/explanation/method.md` has the formulas, priors and references. The files in the order of a fit: `map_rows`,
-//! `projective_mean`, `noise`, `kernel`, `posterior`, `hyperparameters`, `upright_camera`, `groups`,
+//! `projective_mean`, `noise`, `kernel`, `known_rows`, `posterior`, `hyperparameters`, `upright_camera`, `groups`,
 //! `candidate`, `leave_out`, `sessions`, `fit`, `companion`; `ground_camera` for association without a model; of an answer: `predictor`, `box_plausibility`, `hidden_foot`;
 //! `recipe` and `stored` connect both to the rest of the module; `foot_map` takes the map of another fit, and `upright_geometry` gives it a prior. Random starts have a seed of their own.
 
@@ -18,6 +18,7 @@ mod groups;
 mod hidden_foot;
 mod hyperparameters;
 mod kernel;
+mod known_rows;
 mod leave_out;
 mod map_rows;
 mod noise;
@@ -37,6 +38,8 @@ pub(crate) use fit::SHARED_BIAS_SHARE;
 pub(crate) use foot_map::{FittedFootMap, FootCovariance, widen_map};
 pub use ground_camera::{GroundCamera, GroundPoint};
 pub use hidden_foot::HiddenFoot;
+pub(crate) use hyperparameters::SESSION_SHARE;
+pub(crate) use known_rows::{KNOWN_POINTS, POINTER_SIGMA_PX};
 pub(crate) use leave_out::{SequenceMean, widening};
 pub(crate) use noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 pub(super) use recipe::DEFINITION;

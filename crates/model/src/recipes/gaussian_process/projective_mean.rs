@@ -247,6 +247,11 @@ impl ProjectiveMean {
 }
 
 impl EvaluatedMean {
+    /// True where the ratio is bounded, so that its tangent says nothing.
+    pub(crate) fn is_beyond_horizon(&self) -> bool {
+        self.denominator <= MIN_DENOMINATOR
+    }
+
     /// How far a step of the coefficients moves east and north along the tangent, m.
     #[inline]
     pub(crate) fn moved_m(&self, step: &[f64; COEFFICIENTS]) -> [f64; 2] {

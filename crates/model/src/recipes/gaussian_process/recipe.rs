@@ -6,6 +6,7 @@ use super::box_plausibility::RecentBoxes;
 use super::companion;
 use super::fit::{FitReport, FitSettings, fit as fit_map};
 use super::hidden_foot::HiddenFoot;
+use super::known_rows::{KNOWN_POINTS, KnownFoot};
 use super::map_rows::MapRows;
 use super::noise::Epoch;
 use super::onnx;
@@ -13,7 +14,7 @@ use super::predictor::{MapPrediction, Predictor};
 use super::upright_camera::UprightCamera;
 use crate::artifact::{LEAST_GNSS_WHITE_SHARE, ModelParts};
 use crate::domain::{
-    BoundingBox, Error, ErrorKind, NoiseCorrelation, Recipe, Result, SessionBias, TargetClass,
+    BoundingBox, Error, ErrorKind, KnownPoint, NoiseCorrelation, Recipe, Result, SessionBias, TargetClass,
 };
 use crate::encoder::auto_encoder::AutoEncoder;
 use crate::encoder::features::{Encoded, features_of, reconstruction_error};
@@ -28,6 +29,9 @@ use crate::samples::rows::TrainingRows;
 /// all other classes, whose heights only have to agree with each other. ONVIF and Axis say `Human`, DeepStream `Person`.
 const TARGET_HEIGHTS: [(&[&str], (f64, f64)); 3] =
     [(&["person", "pedestrian", "human"], (1.70, 0.05)), (&["car"], (1.50, 0.10)), (&[], (1.70, 1.0))];
+
+/// A known point that is so many standard deviations per axis away from the map is probably wrong.
+const CONTRADICTED_SIGMAS: f64 = 4.0;
 
 /// The recipe.
 pub(crate) static DEFINITION: Definition = Definition {
@@ -76,8 +80,17 @@ impl Estimator for GaussianProcess {
             receiver_m2: (!context.e_gnss_is_estimated).then_some(context.e_gnss_m2),
             seed: context.seed,
             upright,
+            known: context.known_points.iter().map(|point| known_foot(point, &rows.plane)).collect(),
         };
-        let fitted = fit_map(&map_rows, &map_settings);
+        let mut fitted = fit_map(&map_rows, &map_settings);
+        if fitted.is_none() && !map_settings.known.is_empty() {
+            fitted = fit_map(&map_rows, &FitSettings { known: Vec::new(), ..map_settings });
+            if phase.is_final {
+                phase.run.note(
+                    "the known points contradict each other or the fixes, and are left out; check them",
+                )?;
+            }
+        }
         let Some((predictor, report)) = fitted else {
             return Err(FitError::Unusable(Error::field(
                 ErrorKind::UnusableSamples,
@@ -99,6 +112,15 @@ impl Estimator for GaussianProcess {
             companion::fit(rows, epochs, &mut parts, phase)?;
         }
         Ok(FittedEncoder { parts, covariance: None })
+    }
+}
+
+fn known_foot(point: &KnownPoint, plane: &LocalPlane) -> KnownFoot {
+    let EastNorth { east_m, north_m } = plane.to_plane(point.position);
+    KnownFoot {
+        image_px: point.image_px,
+        position_m: [east_m, north_m],
+        variance_m2: point.sigma_m.variance_m2(),
     }
 }
 
@@ -182,6 +204,9 @@ fn put_report(report: &FitReport, parts: &mut ModelParts) {
         parts.set(&format!("held_out_m2.{name}"), *miss_m2);
         parts.set(&format!("jackknife_share.{name}"), *jackknife_share);
     }
+    if !report.known_m.is_empty() {
+        parts.set(KNOWN_POINTS, report.known_m.len() as f64);
+    }
     if let Some(sessions) = report.sessions {
         parts.set("sessions", sessions.count as f64);
         parts.set("between_sessions_m2", sessions.between_m2);
@@ -205,6 +230,14 @@ fn note(report: &FitReport, phase: &mut Phase<'_, '_>) -> Result<(), FitError> {
             "map {name}: weight {weight:.2}; root mean square to the fixes of left-out groups {:.3} m per axis",
             miss_m2.sqrt()
         ))?;
+    }
+    for (number, (apart_m, sigma_m)) in (1..).zip(&report.known_m) {
+        let advice = if *apart_m > CONTRADICTED_SIGMAS * sigma_m {
+            ": the map contradicts it; check where it is in the image and on the earth"
+        } else {
+            ""
+        };
+        phase.run.note(&format!("known point {number}: {apart_m:.2} m from the map{advice}"))?;
     }
     phase.run.note(&format!(
         "{} groups left out in turn: {:.1} % of their fixes inside the stated radius; map variance widened by {:.2}",

@@ -6,6 +6,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::box_plausibility::RecentBoxes;
 use super::fit::{FitReport, FitSettings, fit, own_miss_m2};
+use super::known_rows::KnownFoot;
 use super::map_rows::MapRows;
 use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use super::posterior::{Gram, Posterior, TangentPrior};
@@ -65,7 +66,14 @@ fn fitted(rows: &MapRows) -> (Predictor, FitReport) {
 }
 
 fn settings(upright: Option<UprightCamera>) -> FitSettings {
-    FitSettings { bias_sigma_m: None, white_share: 0.15, receiver_m2: None, seed: 1, upright }
+    FitSettings {
+        bias_sigma_m: None,
+        white_share: 0.15,
+        receiver_m2: None,
+        seed: 1,
+        upright,
+        known: Vec::new(),
+    }
 }
 
 /// Mean error, m, and share of the truths inside the stated radius.
@@ -423,4 +431,49 @@ fn heights_are_known_by_the_names_of_all_detectors() {
         assert_eq!(height_m(class.as_str()), expected, "{class:?}");
     }
     assert!(!super::GroundCamera::knows_height_of(&TargetClass::new("ship").expect("a class")));
+}
+
+/// Four boxes far apart from each other, as an operator would click places.
+fn known_points(tests: &[(Box4, [f64; 2])], sigma_m: f64) -> Vec<KnownFoot> {
+    let along = |weights: [f64; 2]| {
+        let of = |(sides, _): &&(Box4, [f64; 2])| weights[0] * sides[0] + weights[1] * sides[1];
+        tests.iter().max_by(|one, other| of(one).total_cmp(&of(other))).expect("boxes")
+    };
+    let corners = [[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]].map(along);
+    let point = |([u, v, ..], truth_m): &(Box4, [f64; 2])| KnownFoot {
+        image_px: [*u, *v],
+        position_m: *truth_m,
+        variance_m2: sigma_m * sigma_m,
+    };
+    corners.map(point).to_vec()
+}
+
+#[test]
+fn known_points_take_away_the_bias_of_one_receiver_and_a_wrong_one_does_little() {
+    let (mut without_m, mut with_m, mut wrong_m, mut covered, mut stated) = (0.0, 0.0, 0.0, 0.0, [0.0; 2]);
+    let worlds = 6;
+    for seed in 0..worlds {
+        let (rows, tests) = walkers(4800 + seed, 1, 600, 2.0);
+        let fitted = |known: Vec<KnownFoot>| {
+            let settings = FitSettings { known, ..settings(None) };
+            fit(&rows, &settings).expect("rows that determine a map").0
+        };
+        let points = known_points(&tests, 0.3);
+        let mut one_wrong = points.clone();
+        one_wrong[0].position_m[0] += 30.0;
+        let (plain, with, wrong) = (fitted(Vec::new()), fitted(points), fitted(one_wrong));
+        without_m += score(&plain, &tests, 0.0).0 / worlds as f64;
+        let (error_m, inside) = score(&with, &tests, 0.0);
+        with_m += error_m / worlds as f64;
+        covered += inside / worlds as f64;
+        wrong_m += score(&wrong, &tests, 0.0).0 / worlds as f64;
+        stated[0] += stated_m(&plain, &tests) / worlds as f64;
+        stated[1] += stated_m(&with, &tests) / worlds as f64;
+    }
+    println!(
+        "{without_m:.2} m, with four points {with_m:.2} m ({covered:.2} inside), one wrong {wrong_m:.2} m"
+    );
+    println!("stated per axis {:.2} m, with four points {:.2} m", stated[0], stated[1]);
+    assert!(with_m < 0.5 * without_m && wrong_m < 0.8 * without_m, "{without_m} {with_m} {wrong_m}");
+    assert!(covered > 0.85 && stated[1] < 0.6 * stated[0], "{covered} {stated:?}");
 }

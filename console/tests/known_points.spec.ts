@@ -17,7 +17,7 @@ test('a click on the picture begins a known point, and the profile keeps it', as
   await fields.getByLabel('Latitude, degrees').fill('59.4368');
   await page.getByRole('button', { name: 'Save' }).click();
   await expect(page.getByText('Saved')).toBeVisible();
-  const point = { x_px: 640, y_px: 355.5, position: { longitude_deg: 24.7453, latitude_deg: 59.4368 }, sigma_m: 0.3 };
+  const point = { x_px: 640, y_px: 355.5, position: { longitude_deg: 24.7453, latitude_deg: 59.4368 }, sigma_m: 0.5 };
   expect((await server.request<Camera>('GET', '/v1/cameras/gate')).known_points).toEqual([point]);
 
   await page.getByRole('button', { name: 'Remove point 1' }).click();

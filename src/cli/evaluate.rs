@@ -95,7 +95,7 @@ pub(super) struct Evaluate {
     #[arg(long, alias = "first-redraw", value_name = "N", requires = "site", default_value_t = 1, value_parser = clap::value_parser!(u64).range(0..=MAX_FIRST_DRAW))]
     first_draw: u64,
     /// Number of known points of each camera that take part in the training, for --site: true places near the corners of the
-    /// image, with an error of 0.3 m per axis
+    /// image, with an error of 0.5 m per axis
     #[arg(long, value_name = "N", requires = "site", conflicts_with = "matching", default_value_t = 0, value_parser = clap::value_parser!(u8).range(0..=4))]
     known_points: u8,
     /// Evaluate how boxes are matched with receivers instead of the world tracks, for --site: with a model that is known

@@ -123,9 +123,9 @@ pub(super) struct KnownPoint {
     y_px: f64,
     /// Where it is on the earth.
     position: Position,
-    /// Standard deviation of that position per axis, m, 0.001 to 10,000; 0.3 if left out.
+    /// Standard deviation of that position per axis, m, 0.001 to 10,000; 0.5 if left out.
     #[serde(default = "KnownPoint::default_sigma_m")]
-    #[schema(minimum = 0.001, maximum = 10_000.0, default = 0.3)]
+    #[schema(minimum = 0.001, maximum = 10_000.0, default = 0.5)]
     sigma_m: f64,
 }
 

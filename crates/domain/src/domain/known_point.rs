@@ -19,9 +19,9 @@ pub struct KnownPoint {
 impl KnownPoint {
     /// Points of a camera at most.
     pub const MOST: usize = 100;
-    /// Standard deviation per axis where none is stated, m: half a step, for the lower edge of a box is not exactly where
-    /// its target stands.
-    pub const DEFAULT_SIGMA_M: f64 = 0.3;
+    /// Standard deviation per axis where none is stated, m: a step, for the lower edge of a box is not exactly where its
+    /// target stands.
+    pub const DEFAULT_SIGMA_M: f64 = 0.5;
     /// Largest coordinate in an image whose size is unknown, px.
     const LARGEST_PX: f64 = 1e5;
 

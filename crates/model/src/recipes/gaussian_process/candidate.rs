@@ -17,7 +17,9 @@ use super::upright_camera::{Parameters, UprightCamera};
 
 /// Rows that hyper-parameters are estimated on at most.
 const MAX_LIKELIHOOD_ROWS: usize = 2_500;
+/// Inducing points of a map at most.
 pub(crate) const MAX_INDUCING: usize = 64;
+/// The same where hyper-parameters are estimated.
 const MAX_LIKELIHOOD_INDUCING: usize = 40;
 /// Rows per inducing point, at least.
 const ROWS_PER_INDUCING: usize = 5;
@@ -49,12 +51,29 @@ impl MapForm {
 /// weights of each axis.
 type Deviation = (DVector<f64>, [DVector<f64>; 2]);
 
+/// The inducing points of the residual.
+#[derive(Debug)]
+pub(crate) struct Inducing {
+    /// Those of the map.
+    of_map: Vec<[f64; 4]>,
+    /// Fewer, where hyper-parameters are estimated.
+    of_likelihood: Vec<[f64; 4]>,
+}
+
+impl Inducing {
+    pub(crate) fn new(inputs: &[[f64; 4]]) -> Self {
+        let at_most = |most| inducing_points(inputs, (inputs.len() / ROWS_PER_INDUCING).clamp(4, most));
+        Self { of_map: at_most(MAX_INDUCING), of_likelihood: at_most(MAX_LIKELIHOOD_INDUCING) }
+    }
+}
+
 /// A map on its way: rows, where it is linearised, and what gross errors have cost each row.
 #[derive(Debug, Clone)]
 pub(crate) struct Draft<'a> {
     pub(crate) form: MapForm,
     pub(crate) rows: &'a MapRows,
     pub(crate) inputs: &'a [[f64; 4]],
+    pub(crate) inducing: &'a Inducing,
     /// Covariance of left, top, right and bottom, px2.
     pub(crate) edge_px2: &'a [f64; 16],
     pub(crate) mean: ProjectiveMean,
@@ -111,8 +130,7 @@ impl<'a> Draft<'a> {
             let mut draft = Draft { form: MapForm::Upright, upright: Some((camera, placed)), ..self.clone() };
             draft.set_coefficients(&camera.coefficients(&placed, &self.mean)?)?;
             draft.relinearize(parameters)?;
-            let columns = draft.columns(draft.evidence(), &[], parameters)?;
-            let gram = draft.gram(&columns, &[], parameters)?;
+            let gram = draft.gram(&draft.columns(draft.evidence(), parameters)?, parameters)?;
             let at = draft.upright.as_ref()?.1;
             let score = gram.misfit_at(&DVector::from_column_slice(&draft.mean.coefficients))
                 + 2.0 * camera.evidence(&at)?.misfit;
@@ -144,13 +162,10 @@ impl<'a> Draft<'a> {
         self.set_coefficients(&foot)
     }
 
-    fn inducing(&self, most: usize) -> Vec<[f64; 4]> {
+    fn inducing(&self) -> &'a [[f64; 4]] {
         match self.form {
-            MapForm::Homography | MapForm::Upright => Vec::new(),
-            MapForm::Residual => {
-                let count = (self.inputs.len() / ROWS_PER_INDUCING).clamp(4, most);
-                inducing_points(self.inputs, count)
-            }
+            MapForm::Homography | MapForm::Upright => &[],
+            MapForm::Residual => &self.inducing.of_map,
         }
     }
 
@@ -177,7 +192,7 @@ impl<'a> Draft<'a> {
         LikelihoodRows {
             epochs: &rows.epochs,
             inputs: &inputs,
-            inducing: &self.inducing(MAX_LIKELIHOOD_INDUCING),
+            inducing: &self.inducing.of_likelihood,
             tangent: &tangent,
             labels_m: &labels_m,
             white_m2: &white_m2,
@@ -229,48 +244,61 @@ impl<'a> Draft<'a> {
     fn columns(
         &self,
         Evidence { rows, inputs }: Evidence<'_>,
-        inducing: &[[f64; 4]],
         parameters: &Hyperparameters,
     ) -> Option<Columns> {
+        let inducing = self.inducing();
         let (tangent, labels_m) = linearize(rows, &self.mean);
         let (phi, left_out_m2) = match self.form {
-            MapForm::Homography | MapForm::Upright => {
-                (DMatrix::zeros(inputs.len(), 0), vec![0.0; inputs.len()])
-            }
-            MapForm::Residual => kernel_columns(inputs, inducing, parameters)?,
+            MapForm::Residual if !inputs.is_empty() => kernel_columns(inputs, inducing, parameters)?,
+            _ => (DMatrix::zeros(inputs.len(), inducing.len()), vec![0.0; inputs.len()]),
         };
         Some(Columns { tangent, labels_m, phi, left_out_m2 })
     }
 
     /// Gram matrix of all rows and of the known points.
-    fn gram(&self, columns: &Columns, inducing: &[[f64; 4]], parameters: &Hyperparameters) -> Option<Gram> {
-        let all: Vec<usize> = (0..self.inputs.len()).collect();
-        let of_rows = columns.gram(&all, &self.rows.epochs, parameters, &self.white_m2());
-        self.with_known(of_rows, inducing, parameters)
+    fn gram(&self, columns: &Columns, parameters: &Hyperparameters) -> Option<Gram> {
+        let variances_m2 = columns.variances_m2(&self.white_m2());
+        let whitener = ReceiverWhitener::new(&self.rows.epochs, &parameters.noise, &variances_m2);
+        self.with_known(Gram::new(columns.joined(), &whitener), parameters)
+    }
+
+    /// Gram matrices of groups of rows.
+    fn gram_of_groups(
+        &self,
+        columns: &Columns,
+        grouping: &Grouping,
+        parameters: &Hyperparameters,
+    ) -> Vec<Gram> {
+        let (joined, variances_m2) = (columns.joined(), columns.variances_m2(&self.white_m2()));
+        let of_group = |rows: &Vec<usize>| {
+            let epochs: Vec<Epoch> = rows.iter().map(|row| self.rows.epochs[*row]).collect();
+            let variances_m2: Vec<f64> = rows.iter().map(|row| variances_m2[*row]).collect();
+            let whitener = ReceiverWhitener::new(&epochs, &parameters.noise, &variances_m2);
+            Gram::new(joined.select_rows(rows), &whitener)
+        };
+        grouping.members().iter().map(of_group).collect()
     }
 
     /// The Gram matrix of rows with that of the known points added.
-    fn with_known(&self, of_rows: Gram, inducing: &[[f64; 4]], parameters: &Hyperparameters) -> Option<Gram> {
+    fn with_known(&self, of_rows: Gram, parameters: &Hyperparameters) -> Option<Gram> {
         if self.known.is_empty() {
             return Some(of_rows);
         }
-        let columns = self.columns(self.known.evidence(), inducing, parameters)?;
-        let variances_m2: Vec<f64> =
-            self.known_m2().iter().zip(&columns.left_out_m2).map(|(own, left_out)| own + left_out).collect();
-        Some(of_rows.plus(&Gram::new(columns.joined(), &self.known.whitener(&variances_m2))))
+        let columns = self.columns(self.known.evidence(), parameters)?;
+        let whitener = self.known.whitener(&columns.variances_m2(&self.known_m2()));
+        Some(of_rows.plus(&Gram::new(columns.joined(), &whitener)))
     }
 
     /// Gauss-Newton steps of the mean, with the weights of rows in gross error found again.
     pub(crate) fn relinearize(&mut self, parameters: &Hyperparameters) -> Option<()> {
-        let inducing = self.inducing(MAX_INDUCING);
         for _ in 0..self.form.relinearizations() {
-            let columns = self.columns(self.evidence(), &inducing, parameters)?;
-            let gram = self.gram(&columns, &inducing, parameters)?;
+            let columns = self.columns(self.evidence(), parameters)?;
+            let gram = self.gram(&columns, parameters)?;
             let posterior = Posterior::new(&gram, &self.prior(parameters)?)?;
             let kernel_m =
                 |columns: &Columns| posterior.kernel.each_ref().map(|weights| &columns.phi * weights);
             let of_rows = kernel_m(&columns);
-            let of_known = kernel_m(&self.columns(self.known.evidence(), &inducing, parameters)?);
+            let of_known = kernel_m(&self.columns(self.known.evidence(), parameters)?);
             self.move_to(&posterior.tangent)?;
             let residuals_m = less_kernel(&self.rows.misses_m(&self.mean), &of_rows);
             let of_box = self.box_noise_m2();
@@ -294,19 +322,16 @@ impl<'a> Draft<'a> {
     /// Groups' Gram matrices add up, so leaving one out is a subtraction; where a target's segments are
     /// groups of their own, each is whitened on its own.
     pub(crate) fn solve(self, parameters: &Hyperparameters, grouping: &Grouping) -> Option<MapCandidate> {
-        let inducing = self.inducing(MAX_INDUCING);
-        let columns = self.columns(self.evidence(), &inducing, parameters)?;
+        let columns = self.columns(self.evidence(), parameters)?;
         let prior = self.prior(parameters)?;
-        let white_m2 = self.white_m2();
-        let of = |rows: &[usize]| columns.gram(rows, &self.rows.epochs, parameters, &white_m2);
-        let total =
-            self.with_known(of(&(0..self.inputs.len()).collect::<Vec<_>>()), &inducing, parameters)?;
+        let total = self.gram(&columns, parameters)?;
         let posterior = Posterior::new(&total, &prior)?;
-        let groups: Vec<Gram> = grouping.members().iter().map(|rows| of(rows)).collect();
+        let groups = self.gram_of_groups(&columns, grouping, parameters);
         let sum = groups.iter().cloned().reduce(|sum, own| sum.plus(&own))?;
-        let sum = self.with_known(sum, &inducing, parameters)?;
+        let sum = self.with_known(sum, parameters)?;
         let without =
             groups.iter().map(|own| Posterior::new(&sum.minus(own), &prior)).collect::<Option<_>>()?;
+        let inducing = self.inducing().to_vec();
         let Self { form, mean, .. } = self;
         Some(MapCandidate {
             form,
@@ -327,13 +352,9 @@ impl Columns {
         join(&[&self.tangent, &self.phi, &self.labels_m])
     }
 
-    /// Gram matrix of some rows, in their order.
-    fn gram(&self, rows: &[usize], epochs: &[Epoch], parameters: &Hyperparameters, white_m2: &[f64]) -> Gram {
-        let own: Vec<Epoch> = rows.iter().map(|row| epochs[*row]).collect();
-        let variances: Vec<f64> = rows.iter().map(|row| self.left_out_m2[*row] + white_m2[*row]).collect();
-        let columns = self.joined();
-        let columns = if rows.len() == epochs.len() { columns } else { columns.select_rows(rows) };
-        Gram::new(columns, &ReceiverWhitener::new(&own, &parameters.noise, &variances))
+    /// White variance per row with what the inducing points leave out, m2.
+    fn variances_m2(&self, white_m2: &[f64]) -> Vec<f64> {
+        self.left_out_m2.iter().zip(white_m2).map(|(left_out, white)| left_out + white).collect()
     }
 
     fn slopes(&self, row: usize) -> [[f64; COEFFICIENTS]; 2] {

@@ -1,7 +1,7 @@
 //! From rows to a model: robust start, hyper-parameters, candidates, weights, calibration.
 
 use super::box_plausibility::BoxPlausibility;
-use super::candidate::{Draft, MapCandidate, MapForm};
+use super::candidate::{Draft, Inducing, MapCandidate, MapForm};
 use super::edge_noise::edge_covariance_px2;
 use super::groups::{Grouping, groups};
 use super::hyperparameters::{Hyperparameters, Priors};
@@ -181,10 +181,12 @@ fn solve(
     let white =
         ReceiverWhitener::new(&rows.epochs, &ReceiverNoise::white(scatter_m2), &vec![0.0; rows.boxes.len()]);
     let inflation_m2 = white.inflation_m2(&residuals_m);
+    let inducing = Inducing::new(inputs);
     let mut residual = Draft {
         form: MapForm::Residual,
         rows,
         inputs,
+        inducing: &inducing,
         edge_px2,
         known_inflation_m2: known.first_inflation_m2(&mean, scatter_m2),
         mean,

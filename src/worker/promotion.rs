@@ -16,7 +16,7 @@ use crate::domain::{
     BoundingBox, CameraId, HeldOutSampleError, ModelMetadata, Result, Sample, TargetId, TimeRange,
 };
 use crate::geo::Position;
-use crate::model::{Artifact, Regressor};
+use crate::model::{Artifact, KNOWN_POINTS, Regressor};
 use crate::store::StoredHeldOutError;
 
 /// Held-out errors that are stored with a version.
@@ -252,8 +252,7 @@ async fn measure(
 
 /// Why fixes cannot judge between two versions: they have the bias that known points take away.
 fn by_other_known_points(number: u32, active: &ModelMetadata, new: &ModelMetadata) -> Option<String> {
-    let [active, new] =
-        [active, new].map(|it| it.parameters.get("known_points").copied().unwrap_or_default());
+    let [active, new] = [active, new].map(|it| it.parameters.get(KNOWN_POINTS).copied().unwrap_or_default());
     (new > 0.0 && new != active).then(|| {
         format!("it was trained with {new} known points and version {number} with {active}, and the fixes cannot judge that")
     })

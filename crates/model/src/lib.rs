@@ -52,7 +52,7 @@ pub use fitting::{
     estimate_gnss_noise, fit, fit_site_models, fit_with,
 };
 pub use progress::{FitError, FitEvent};
-pub use recipes::gaussian_process::{GroundCamera, GroundPoint, HiddenFoot, RecentBoxes};
+pub use recipes::gaussian_process::{GroundCamera, GroundPoint, HiddenFoot, KNOWN_POINTS, RecentBoxes};
 pub use regressor::{JointError, Regression, Regressor};
 pub use samples::mirroring::{FootPosition, is_mirrored, median_position};
 pub use samples::rows::{FEWEST_SAMPLES, SMALLEST_SPREAD_M};

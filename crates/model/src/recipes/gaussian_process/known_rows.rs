@@ -12,7 +12,7 @@ use super::noise::{Epoch, ReceiverNoise, ReceiverWhitener};
 use super::projective_mean::{Box4, ProjectiveMean};
 
 /// Name of the parameter that says how many known points a model was trained with.
-pub(crate) const KNOWN_POINTS: &str = "known_points";
+pub const KNOWN_POINTS: &str = "known_points";
 /// Standard deviation per axis of a pointer on a picture, px.
 pub(crate) const POINTER_SIGMA_PX: f64 = 2.0;
 /// Standard deviations of the fixes by which their map may be off where a point is.

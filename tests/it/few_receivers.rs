@@ -10,14 +10,16 @@ use rand::SeedableRng as _;
 use rand::seq::SliceRandom as _;
 use rand_chacha::ChaCha8Rng;
 use sightfix::domain::{
-    BoundingBox, Detection, GnssError, ImageSize, KnownPoint, ReceivedFix, Receivers, Recipe, Sample, SigmaM,
-    TargetClass, TargetId, TimeBounds,
+    BoundingBox, Detection, GaussMarkovNoise, GnssError, ImageSize, KnownPoint, NoiseCorrelation,
+    ReceivedFix, Receivers, Recipe, Sample, SigmaM, TargetClass, TargetId, TimeBounds,
 };
+use sightfix::evaluation::baselines::homography;
+use sightfix::evaluation::site::{nearest_to_corners, position_at};
 use sightfix::exchange::{FixFormat, Format, RowRules, read_detections, read_received_fixes};
 use sightfix::fusion::pairing::{PairingRule, PairingSettings, pair};
 use sightfix::geo::{EastNorth, LocalPlane, Position, distance_m};
 use sightfix::model::{FitInput, FitOptions, fit};
-use sightfix::simulation::{Options, Scene, simulate_split, standard_normal};
+use sightfix::simulation::{Options, Scene, SimulatedReceiver, simulate_split, standard_normal};
 
 const RECEIVERS: [usize; 5] = [2, 3, 5, 10, 20];
 
@@ -47,17 +49,21 @@ struct Score {
 }
 
 impl Recording {
-    /// Fits a model with the fixes of some receivers, chosen by the seed; `None` if they do not suffice.
-    fn score(&self, receivers: usize, seed: u64, beside: Beside) -> Option<Score> {
+    /// The samples of some receivers, chosen by the seed.
+    fn samples_of(&self, receivers: usize, seed: u64) -> Vec<Sample> {
         let mut carriers: Vec<&TargetId> = self.samples.keys().collect();
         carriers.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
-        let samples: Vec<Sample> =
-            carriers.iter().take(receivers).flat_map(|carrier| self.samples[*carrier].clone()).collect();
+        carriers.iter().take(receivers).flat_map(|carrier| self.samples[*carrier].clone()).collect()
+    }
+
+    /// Fits a model with the fixes of some receivers, chosen by the seed; `None` if they do not suffice.
+    fn score(&self, recipe: Recipe, receivers: usize, seed: u64, beside: Beside) -> Option<Score> {
+        let samples = self.samples_of(receivers, seed);
         let paired: BTreeSet<_> = samples.iter().map(|sample| (sample.time, &sample.target_id)).collect();
         let is_unpaired = |own: &&Detection| beside.boxes && !paired.contains(&(own.time, &own.target_id));
         let unpaired: Vec<Detection> = self.boxes.iter().filter(is_unpaired).cloned().collect();
         let options = FitOptions {
-            recipe: Recipe::GaussianProcess,
+            recipe,
             seed: 1,
             epochs: None,
             image_size: Some(self.image_size),
@@ -72,26 +78,40 @@ impl Recording {
         let fitted = fit(input, &options, &mut |_| ControlFlow::Continue(()))
             .inspect_err(|error| println!("{receivers} receivers, draw {seed}, {beside:?}: {error}"));
         let model = fitted.ok()?.load().expect("a model");
-        let mut score = Score::default();
-        for (bounding_box, truth) in &self.tests {
+        Some(self.scored(|bounding_box| {
             let regression = model.regress(bounding_box, None);
-            let error_m = distance_m(model.plane().to_position(regression.regressed), *truth);
             let r95_m = regression.r95_scale * regression.e_regression_m2.sqrt();
-            score.mean_m += error_m / self.tests.len() as f64;
-            score.coverage += f64::from(u8::from(error_m <= r95_m)) / self.tests.len() as f64;
-        }
-        Some(score)
+            Some((model.plane().to_position(regression.regressed), r95_m))
+        }))
+    }
+
+    /// The robust homography of the feet of the same samples, where its answers are below its horizon; it states no radius.
+    fn score_of_homography(&self, receivers: usize, seed: u64) -> Score {
+        let samples = self.samples_of(receivers, seed);
+        let plane = LocalPlane::new(samples[0].fix.position);
+        let pairs: Vec<(BoundingBox, EastNorth)> =
+            samples.iter().map(|sample| (sample.bounding_box, plane.to_plane(sample.fix.position))).collect();
+        let map = homography::fit(&pairs, seed).expect("enough samples");
+        self.scored(|bounding_box| Some((plane.to_position(map.project(bounding_box)?), f64::NAN)))
+    }
+
+    fn scored(&self, answer: impl Fn(&BoundingBox) -> Option<(Position, f64)>) -> Score {
+        let of_box = |(bounding_box, truth): &(BoundingBox, Position)| {
+            let (position, r95_m) = answer(bounding_box)?;
+            Some((distance_m(position, *truth), r95_m))
+        };
+        let errors: Vec<(f64, f64)> = self.tests.iter().filter_map(of_box).collect();
+        let mean = |of: fn(&(f64, f64)) -> f64| errors.iter().map(of).sum::<f64>() / errors.len() as f64;
+        let coverage = mean(|(error_m, r95_m)| f64::from(u8::from(error_m <= r95_m)));
+        Score { mean_m: mean(|(error_m, _)| *error_m), coverage }
     }
 
     /// Places near the corners of what is seen, where an operator has read them off a picture and a map.
     fn known_points(&self, count: usize, seed: u64) -> Vec<KnownPoint> {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
-        let corners = [[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]];
-        let mut point = |[right, down]: [f64; 2]| {
-            let along =
-                |(own, _): &&(BoundingBox, Position)| right * own.foot_px()[0] + down * own.foot_px()[1];
-            let (own, truth) =
-                self.tests.iter().max_by(|one, other| along(one).total_cmp(&along(other))).expect("boxes");
+        let feet_px: Vec<[f64; 2]> = self.tests.iter().map(|(own, _)| own.foot_px()).collect();
+        let mut point = |at: usize| {
+            let (own, truth) = &self.tests[at];
             let mut draw_m = || KnownPoint::DEFAULT_SIGMA_M * standard_normal(&mut random);
             let error = EastNorth { east_m: draw_m(), north_m: draw_m() };
             KnownPoint {
@@ -100,7 +120,7 @@ impl Recording {
                 sigma_m: SigmaM::new(KnownPoint::DEFAULT_SIGMA_M).expect("a sigma"),
             }
         };
-        corners.into_iter().take(count).map(&mut point).collect()
+        nearest_to_corners(&feet_px).into_iter().take(count).map(&mut point).collect()
     }
 
     /// A simulated square with 40 walkers, each of whom passes for a minute.
@@ -124,8 +144,9 @@ impl Recording {
         Self { image_size: train.image_size, samples, boxes, tests }
     }
 
-    /// One camera of the plaza. Whose a phone is, is known; other targets have the tracker's ids.
-    fn plaza(camera: &str) -> Self {
+    /// One camera of the plaza. Whose a phone is, is known; other targets have the tracker's ids. With a seed the errors of
+    /// the fixes are drawn again.
+    fn plaza(camera: &str, redrawn: Option<u64>) -> Self {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/plaza");
         let table = |name: &str| {
             let mut reader = csv::Reader::from_path(folder.join(name)).expect("the file");
@@ -144,7 +165,10 @@ impl Recording {
                 (key, Position::new(degrees(2), degrees(3)).expect("a position"))
             })
             .collect();
-        let fixes = plaza_fixes(&folder.join("fixes.csv"));
+        let mut fixes = plaza_fixes(&folder.join("fixes.csv"));
+        if let Some(seed) = redrawn {
+            fixes = with_redrawn_errors(fixes, &truths, seed);
+        }
         let carriers: BTreeSet<String> = fixes
             .iter()
             .filter_map(|fix| fix.receiver_id.as_ref())
@@ -190,6 +214,36 @@ fn plaza_fixes(path: &Path) -> Vec<ReceivedFix> {
     rows.map(|row| row.expect("a file").expect("a row")).collect()
 }
 
+/// The fixes at the true positions of their carriers with other errors of a phone, as the recording states them.
+fn with_redrawn_errors(
+    fixes: Vec<ReceivedFix>,
+    truths: &BTreeMap<(jiff::Timestamp, String), Position>,
+    seed: u64,
+) -> Vec<ReceivedFix> {
+    let (coloured_m, white_m) = (2.5_f64, 0.75_f64);
+    let variance_m2 = coloured_m.powi(2) + white_m.powi(2);
+    let correlation = NoiseCorrelation { white_share: white_m.powi(2) / variance_m2, time_constant_s: 30.0 };
+    let noise = GaussMarkovNoise { variance_m2, correlation };
+    let plane = LocalPlane::new(fixes[0].fix.position);
+    let mut paths: BTreeMap<&str, Vec<(jiff::Timestamp, EastNorth)>> = BTreeMap::new();
+    for ((time, person), truth) in truths {
+        paths.entry(person).or_default().push((*time, plane.to_plane(*truth)));
+    }
+    let mut receivers: BTreeMap<String, (SimulatedReceiver, jiff::Timestamp)> = BTreeMap::new();
+    let redrawn = |mut own: ReceivedFix| {
+        let person = own.receiver_id.as_ref()?.as_str().to_owned();
+        let truth = position_at(paths.get(person.as_str())?, own.time)?;
+        let number = receivers.len() as u64;
+        let (receiver, latest) = receivers
+            .entry(person)
+            .or_insert_with(|| (SimulatedReceiver::seeded(noise, seed, number), own.time));
+        let since_s = own.time.duration_since(std::mem::replace(latest, own.time)).as_secs_f64();
+        own.fix.position = plane.to_position(receiver.measure(truth, since_s));
+        Some(own)
+    };
+    fixes.into_iter().filter_map(redrawn).collect()
+}
+
 /// Whether boxes without a fix take part.
 const BOXES: [Beside; 2] =
     [Beside { boxes: false, known_points: 0 }, Beside { boxes: true, known_points: 0 }];
@@ -207,7 +261,10 @@ fn compare(name: &str, recordings: &[Recording], receivers: usize, draws: u64, b
         let scores: Vec<Score> = recordings
             .iter()
             .filter(|recording| recording.samples.len() >= receivers)
-            .flat_map(|recording| (1..=draws).filter_map(|draw| recording.score(receivers, draw, *beside)))
+            .flat_map(|recording| {
+                let own = |draw| recording.score(Recipe::GaussianProcess, receivers, draw, *beside);
+                (1..=draws).filter_map(own)
+            })
             .collect();
         let mean = |of: fn(&Score) -> f64| scores.iter().map(of).sum::<f64>() / scores.len() as f64;
         let (mean_m, coverage) = (mean(|score| score.mean_m), mean(|score| score.coverage));
@@ -234,7 +291,7 @@ fn boxes_without_a_fix_help_where_few_walkers_carry_a_receiver() {
 fn shared_boxes_without_a_fix_by_number_of_receivers() {
     println!("{HEADER}");
     for camera in ["c1", "c2", "c3"] {
-        let recording = [Recording::plaza(camera)];
+        let recording = [Recording::plaza(camera, None)];
         println!(
             "{camera}: {} receivers seen, {} test boxes",
             recording[0].samples.len(),
@@ -271,16 +328,45 @@ fn known_points_help_where_few_walkers_carry_a_receiver() {
 #[test]
 #[ignore = "needs ../shared/data"]
 fn shared_known_points_by_number_of_receivers() {
-    let draws = std::env::var("DRAWS").map_or(2, |draws| draws.parse().expect("a number"));
+    let draws = std::env::var("DRAWS").map_or(1, |draws| draws.parse().expect("a number"));
     println!("{HEADER_OF_POINTS}");
     for camera in ["c1", "c2", "c3"] {
-        let recording = [Recording::plaza(camera)];
+        let recording = [Recording::plaza(camera, None)];
         for receivers in [2, 5, 20] {
             let name = format!("plaza {camera}");
             let line = compare(&name, &recording, receivers, draws, &KNOWN_POINTS);
             println!("{line}");
             let means_m = means_m(&line);
             assert!(means_m[2] < means_m[0], "{line}");
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs ../shared/data"]
+fn shared_phones_beside_the_homography() {
+    let draws = std::env::var("DRAWS").map_or(1, |draws| draws.parse().expect("a number"));
+    println!("| camera | phones | homography | mean | ratio | inside |\n|---|---:|---|---|---:|---|");
+    for camera in ["c1", "c2", "c3"] {
+        let recordings: Vec<Recording> =
+            (1..=draws).map(|draw| Recording::plaza(camera, Some(draw))).collect();
+        for phones in [20, 5] {
+            let beside = Beside { boxes: true, known_points: 0 };
+            let scores = recordings.iter().zip(1..).map(|(recording, draw)| {
+                let own = recording.score(Recipe::Auto, phones, draw, beside).expect("a model");
+                [own.mean_m, recording.score_of_homography(phones, draw).mean_m, own.coverage]
+            });
+            let scores: Vec<[f64; 3]> = scores.collect();
+            let mean = |at: usize| scores.iter().map(|own| own[at]).sum::<f64>() / scores.len() as f64;
+            let with_range = |at: usize| {
+                let least = scores.iter().map(|own| own[at]).fold(f64::INFINITY, f64::min);
+                let most = scores.iter().map(|own| own[at]).fold(0.0, f64::max);
+                format!("{:.2} ({least:.2} to {most:.2})", mean(at))
+            };
+            let [own, of_homography, inside] = [0, 1, 2].map(with_range);
+            let ratio = mean(0) / mean(1);
+            println!("| {camera} | {phones} | {of_homography} | {own} | {ratio:.2} | {inside} |");
+            assert!(ratio < 1.0 && mean(2) > 0.7, "{camera}, {phones}");
         }
     }
 }

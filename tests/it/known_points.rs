@@ -2,6 +2,7 @@
 
 use serde_json::{Value, json};
 use sightfix::domain::BoundingBox;
+use sightfix::evaluation::site::nearest_to_corners;
 use sightfix::exchange::{Format, write_samples};
 use sightfix::geo::{Position, distance_m};
 use sightfix::simulation::{Options, Scene, simulate};
@@ -29,19 +30,16 @@ fn biased_walk() -> (Vec<u8>, Truths) {
 
 /// The corners of what is seen, as an operator reads them off a picture and a map.
 fn corners(truths: &Truths) -> Value {
-    let along = |[u, v]: [f64; 2]| {
-        let of = |(own, _): &&(BoundingBox, Position)| u * own.foot_px()[0] + v * own.foot_px()[1];
-        truths.iter().max_by(|one, other| of(one).total_cmp(&of(other))).expect("boxes")
-    };
-    let point = |weights| {
-        let (own, truth) = along(weights);
+    let feet_px: Vec<[f64; 2]> = truths.iter().map(|(own, _)| own.foot_px()).collect();
+    let point = |at: usize| {
+        let (own, truth) = truths[at];
         let [x_px, y_px] = own.foot_px();
         json!({
             "x_px": x_px, "y_px": y_px, "sigma_m": 0.2,
             "position": {"longitude_deg": truth.longitude_deg(), "latitude_deg": truth.latitude_deg()},
         })
     };
-    json!([[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]].map(point))
+    json!(nearest_to_corners(&feet_px).map(point))
 }
 
 /// Mean error of the active model's answers to boxes alone, m, and the mean 95 % radius that they state, m.

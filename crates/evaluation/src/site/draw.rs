@@ -185,8 +185,9 @@ fn redrawn_box(own: &BoundingBox, image_size: Option<ImageSize>, random: &mut Ch
     BoundingBox::new(left_px, top_px, right_px - left_px, bottom_px - top_px).unwrap_or(*own)
 }
 
-/// A position on a path in the order of time; `None` beyond its ends.
-pub(super) fn position_at(path: &[(Timestamp, EastNorth)], time: Timestamp) -> Option<EastNorth> {
+/// A position on a path in the order of time, m; `None` beyond its ends.
+#[must_use]
+pub fn position_at(path: &[(Timestamp, EastNorth)], time: Timestamp) -> Option<EastNorth> {
     let next = path.partition_point(|(at, _)| *at < time);
     let (next_time, to) = *path.get(next)?;
     if next_time == time {

@@ -11,6 +11,15 @@ const CORNERS: [[f64; 2]; 4] = [[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.
 /// Stream of a seed: apart from those of carriers, cameras and receivers.
 const STREAM: u64 = 900;
 
+/// Indices of the feet that are nearest to the corners of an image, opposite corners first; all 0 without feet.
+#[must_use]
+pub fn nearest_to_corners(feet_px: &[[f64; 2]]) -> [usize; 4] {
+    CORNERS.map(|[right, down]| {
+        let along = |at: &usize| right * feet_px[*at][0] + down * feet_px[*at][1];
+        (0..feet_px.len()).max_by(|one, other| along(one).total_cmp(&along(other))).unwrap_or_default()
+    })
+}
+
 impl SiteRecording {
     /// The same with some known points per camera, at most four: the true places of the feet that are nearest to the corners
     /// of the image, with errors of [`KnownPoint::DEFAULT_SIGMA_M`] per axis that are drawn from a seed.
@@ -24,16 +33,9 @@ impl SiteRecording {
                 .iter()
                 .filter_map(|labelled| Some((labelled.bounding_box, self.truth_of(labelled)?)))
                 .collect();
-            for [right, down] in CORNERS.into_iter().take(count) {
-                let along = |(own, _): &&(BoundingBox, EastNorth)| {
-                    let [u_px, v_px] = own.foot_px();
-                    right * u_px + down * v_px
-                };
-                let Some((bounding_box, truth)) =
-                    true_feet.iter().max_by(|one, other| along(one).total_cmp(&along(other)))
-                else {
-                    continue;
-                };
+            let feet_px: Vec<[f64; 2]> = true_feet.iter().map(|(own, _)| own.foot_px()).collect();
+            for at in nearest_to_corners(&feet_px).into_iter().take(count) {
+                let Some((bounding_box, truth)) = true_feet.get(at) else { continue };
                 let mut error_m = || KnownPoint::DEFAULT_SIGMA_M * standard_normal(&mut random);
                 known_points.push(SiteKnownPoint {
                     camera,

@@ -22,6 +22,8 @@ mod world_figures;
 pub use box_figures::{BoxFigures, BoxRecord};
 pub use crossing_figures::{CrossingFigures, PlaceCounts};
 pub use degradation::Degradation;
+pub use draw::position_at;
+pub use known_points::nearest_to_corners;
 pub use matching_report::{JointFigures, KNOWN_MODEL_SEEDS, MatchingCase, MatchingReport};
 pub use pair_figures::{Bin, PairFigures};
 pub use receiver_feed::NamedFigures;

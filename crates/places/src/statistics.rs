@@ -207,8 +207,9 @@ impl From<Tally> for CountFigure {
         let half = NORMAL_95 * tally.variance.sqrt();
         // Numbers are whole, so the interval is widened to the next ones; a sum of parts may miss one by its rounding.
         let low = (tally.expected - half + 1e-9).floor().max(0.0);
-        let high = (tally.expected + half - 1e-9).ceil();
-        Self { count: tally.count, expected: tally.expected, interval: [low, high.max(low)] }
+        // Zero is added so that no interval ends at -0.
+        let high = (tally.expected + half - 1e-9).ceil().max(low) + 0.0;
+        Self { count: tally.count, expected: tally.expected, interval: [low, high] }
     }
 }
 

@@ -14,11 +14,10 @@
 
 use std::f64::consts::TAU;
 
+use super::axis_filter::AxisFilter;
 use super::tracklet::{Residual, SceneMotion, TimedFix};
 use crate::domain::GaussMarkovNoise;
 
-/// Correlation time of the map's error along a walk, s.
-pub(super) const MAP_TIME_CONSTANT_S: f64 = 20.0;
 /// Correlation time of a target's velocity, s.
 const VELOCITY_TIME_CONSTANT_S: f64 = 8.0;
 /// A share of the fixes has gross errors; these are as likely under either hypothesis.
@@ -74,69 +73,36 @@ impl Innovations {
     }
 }
 
-/// A filter of `N` states, alike for both axes: means by axis, common covariance.
-#[derive(Debug, Clone, Copy)]
-struct AxisFilter<const N: usize> {
-    means: [[f64; N]; 2],
-    covariance: [[f64; N]; N],
-}
-
-impl<const N: usize> AxisFilter<N> {
-    /// Evidence of a measurement of the sum of the states that `observed` marks, in both axes; updates
-    /// the states unless it is an outlier.
-    fn update(&mut self, measured: [f64; 2], observed: [bool; N], noise_m2: f64) -> Innovations {
-        let rows: [f64; N] = std::array::from_fn(|row| {
-            (0..N).filter(|at| observed[*at]).map(|at| self.covariance[row][at]).sum()
-        });
-        let sum = |values: &[f64; N]| -> f64 { (0..N).filter(|at| observed[*at]).map(|at| values[at]).sum() };
-        let variance_m2 = sum(&rows) + noise_m2;
-        let innovations = [0, 1].map(|axis| measured[axis] - sum(&self.means[axis]));
-        let squared = innovations.iter().map(|innovation| innovation * innovation).sum::<f64>() / variance_m2;
-        let nominal = (1.0 - OUTLIER_SHARE) * (-0.5 * squared).exp();
-        let scale = OUTLIER_SCALE * OUTLIER_SCALE;
-        let outlier = OUTLIER_SHARE / scale * (-0.5 * squared / scale).exp();
-        if nominal > outlier {
-            for (mean, innovation) in self.means.iter_mut().zip(innovations) {
-                for (state, row) in mean.iter_mut().zip(rows) {
-                    *state += row / variance_m2 * innovation;
-                }
-            }
-            for (own, row) in self.covariance.iter_mut().zip(rows) {
-                for (element, column) in own.iter_mut().zip(rows) {
-                    *element -= row * column / variance_m2;
-                }
-            }
-        }
-        let squares = -2.0 * (nominal + outlier).max(1e-300).ln();
-        Innovations { fixes: 1.0, log_determinant: 2.0 * variance_m2.ln(), squares }
+/// Evidence of a measurement of the sum of the states that `observed` marks, in both axes; updates the states unless it is an
+/// outlier.
+fn innovations<const N: usize>(
+    filter: &mut AxisFilter<N, 2>,
+    measured: [f64; 2],
+    observed: [bool; N],
+    noise_m2: f64,
+) -> Innovations {
+    let own = filter.innovation(measured, observed, noise_m2);
+    let squared = own.values.iter().map(|value| value * value).sum::<f64>() / own.variance;
+    let nominal = (1.0 - OUTLIER_SHARE) * (-0.5 * squared).exp();
+    let scale = OUTLIER_SCALE * OUTLIER_SCALE;
+    let outlier = OUTLIER_SHARE / scale * (-0.5 * squared / scale).exp();
+    if nominal > outlier {
+        filter.correct(&own);
     }
-
-    /// Multiplies the states by factors and adds variances.
-    fn decay(&mut self, factors: [f64; N], added: [f64; N]) {
-        for mean in &mut self.means {
-            for (state, factor) in mean.iter_mut().zip(factors) {
-                *state *= factor;
-            }
-        }
-        for (row, own) in self.covariance.iter_mut().enumerate() {
-            for (column, element) in own.iter_mut().enumerate() {
-                *element *= factors[row] * factors[column];
-            }
-            own[row] += added[row];
-        }
-    }
+    let squares = -2.0 * (nominal + outlier).max(1e-300).ln();
+    Innovations { fixes: 1.0, log_determinant: 2.0 * own.variance.ln(), squares }
 }
 
 /// Somebody else's motion after the fixes so far: position, velocity, bias.
 #[derive(Debug, Clone, Copy)]
 struct FreeMotion {
-    filter: AxisFilter<3>,
+    filter: AxisFilter<3, 2>,
     last_s: Option<f64>,
 }
 
 impl FreeMotion {
     const fn new() -> Self {
-        Self { filter: AxisFilter { means: [[0.0; 3]; 2], covariance: [[0.0; 3]; 3] }, last_s: None }
+        Self { filter: AxisFilter::new(), last_s: None }
     }
 
     /// Evidence of a fix given those before.
@@ -149,7 +115,7 @@ impl FreeMotion {
             None => self.start(position, bias_m2, white_m2, (speed_m_s, model.motion.spread_m)),
             Some(elapsed_s) => {
                 self.predict(elapsed_s, bias_m2, speed_m_s, model);
-                self.filter.update(position, [true, false, true], white_m2)
+                innovations(&mut self.filter, position, [true, false, true], white_m2)
             }
         }
     }
@@ -238,7 +204,7 @@ pub(super) fn free_log_likelihood(fixes: &[TimedFix], model: &EvidenceModel) -> 
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LikelihoodRatio {
     /// Bias and map error.
-    carried: AxisFilter<2>,
+    carried: AxisFilter<2, 2>,
     carried_sum: Innovations,
     other: SomebodyElse,
     last_s: Option<f64>,
@@ -247,7 +213,7 @@ pub(super) struct LikelihoodRatio {
 impl LikelihoodRatio {
     pub(super) const fn new() -> Self {
         Self {
-            carried: AxisFilter { means: [[0.0; 2]; 2], covariance: [[0.0; 2]; 2] },
+            carried: AxisFilter::new(),
             carried_sum: Innovations { fixes: 0.0, log_determinant: 0.0, squares: 0.0 },
             other: SomebodyElse::new(),
             last_s: None,
@@ -276,18 +242,10 @@ impl LikelihoodRatio {
     pub(super) fn step(&mut self, residual: &Residual, model: &EvidenceModel) {
         let (fix, map_m2) = (&residual.fix, residual.map_variance_m2);
         let bias_m2 = model.bias_m2(fix);
-        match self.last_s {
-            None => self.carried.covariance = [[bias_m2, 0.0], [0.0, map_m2]],
-            Some(last_s) => {
-                let elapsed_s = (fix.time_s - last_s).max(0.0);
-                let bias = model.gnss.correlation.decay(elapsed_s);
-                let map = (-elapsed_s / MAP_TIME_CONSTANT_S).exp();
-                self.carried.decay([bias, map], [bias_m2 * (1.0 - bias * bias), map_m2 * (1.0 - map * map)]);
-            }
-        }
-        self.last_s = Some(fix.time_s);
+        let elapsed_s = self.last_s.replace(fix.time_s).map(|last_s| fix.time_s - last_s);
+        self.carried.advance(elapsed_s, [bias_m2, map_m2], model.gnss.correlation);
         let noise_m2 = model.gnss.white_variance_m2() + residual.box_variance_m2;
-        self.carried_sum.add(self.carried.update(residual.difference_m, [true; 2], noise_m2));
+        self.carried_sum.add(innovations(&mut self.carried, residual.difference_m, [true; 2], noise_m2));
         self.other.step(fix, model);
     }
 }

@@ -2,10 +2,11 @@
 //!
 //! [`match_with_model`] compares fixes with regressed positions; [`match_without_model`] finds the camera,
 //! too. `docs/explanation/association.md` has the formulas and figures. The files in the order of their imports:
-//! `cancellation`, `tracklet`, `disjoint`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`, `world_receivers`.
+//! `cancellation`, `tracklet`, `disjoint`, `axis_filter`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`, `world_receivers`.
 //! Does not use I/O, clocks, or randomness that is not handed in.
 
 mod assignment;
+mod axis_filter;
 mod cancellation;
 mod chains;
 mod companions;

@@ -13,9 +13,10 @@ use std::cmp::Ordering;
 
 use nalgebra::{Complex, DMatrix};
 
+use super::axis_filter::MAP_TIME_CONSTANT_S;
 use super::cancellation::Cancellation;
 use super::disjoint;
-use super::evidence::{EvidenceModel, MAP_TIME_CONSTANT_S, free_log_likelihood};
+use super::evidence::{EvidenceModel, free_log_likelihood};
 use super::tracklet::{Residual, SceneMotion, TimedFix, Tracklet, concurrent};
 use crate::geo::EastNorth;
 

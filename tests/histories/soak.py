@@ -73,8 +73,9 @@ def measure(cluster: Cluster, api: Api, began_s: float) -> Figures:
 
 
 def soak(options: Options, folder: Path, duration_s: float) -> bool:
-    """Measures while the clients work, prints the table and draws `soak.svg`; whether all figures stay flat."""
+    """Measures while the clients work, prints the table and draws `soak.svg` as it goes; whether all stay flat."""
     points: list[Figures] = []
+    print(f"| time (s) | {' | '.join(GROWTH)} |\n|---:|{'---:|' * len(GROWTH)}", flush=True)
     with servers(options, folder, SETTINGS) as cluster:
         hook_port = free_port()
         api = Api(cluster.url, cluster.admin_key, Recorder(Path(os.devnull), "soak"), timeout_s=30)
@@ -83,9 +84,12 @@ def soak(options: Options, folder: Path, duration_s: float) -> bool:
             for point in range(1, POINTS + 1):
                 time.sleep(max(0.0, began_s + point * duration_s / POINTS - time.monotonic()))
                 points.append(measure(cluster, api, began_s))
+                if point % POINTS_PER_LINE == 0:
+                    print(line(points[-1]), flush=True)
+                # Who ends a soak early has what was measured until then.
+                (folder / "soak.svg").write_text(picture(points), encoding="utf-8")
             clients.end()
-    (folder / "soak.svg").write_text(picture(points), encoding="utf-8")
-    return report(points)
+    return stays_flat(points)
 
 
 def picture(points: list[Figures]) -> str:
@@ -101,26 +105,27 @@ def panel(name: str, points: list[Figures], number: int) -> str:
     """The panel of one figure: its name, its largest value and the time at the ends of the axes, and a line."""
     size, left, most = PANEL_PX - 2 * MARGIN_PX, number * PANEL_PX + MARGIN_PX, max(one.values[name] for one in points)
     until_s, bottom = points[-1].time_s, PANEL_PX - MARGIN_PX
-    line = " ".join(
+    path = " ".join(
         f"{left + size * one.time_s / until_s:.1f},{bottom - size * one.values[name] / (most or 1.0):.1f}"
         for one in points
     )
     return (
         f'<rect x="{left}" y="{MARGIN_PX}" width="{size}" height="{size}" fill="#fff" stroke="#888"/>\n'
-        f'<polyline points="{line}" fill="none" stroke="#06c" stroke-width="1.5"/>\n'
+        f'<polyline points="{path}" fill="none" stroke="#06c" stroke-width="1.5"/>\n'
         f'<g fill="#888"><text x="{left}" y="{MARGIN_PX - 6}">{name}, up to {most:.0f}</text>\n'
         f'<text x="{left}" y="{bottom + 14}">0</text>'
         f'<text x="{left + size}" y="{bottom + 14}" text-anchor="end">{until_s:.0f} s</text></g>\n'
     )
 
 
-def report(points: list[Figures]) -> bool:
-    """Prints the table, and which figures have grown; whether none has."""
-    names_of = list(GROWTH)
-    print(f"| time (s) | {' | '.join(names_of)} |\n|---:|{'---:|' * len(names_of)}")
-    for line in points[POINTS_PER_LINE - 1 :: POINTS_PER_LINE]:
-        print(f"| {line.time_s:.0f} | {' | '.join(f'{line.values[name]:.0f}' for name in names_of)} |")
-    grown = [name for name in names_of if has_grown(name, [line.values[name] for line in points])]
+def line(point: Figures) -> str:
+    """A line of the table."""
+    return f"| {point.time_s:.0f} | {' | '.join(f'{point.values[name]:.0f}' for name in GROWTH)} |"
+
+
+def stays_flat(points: list[Figures]) -> bool:
+    """Prints which figures have grown; whether none has."""
+    grown = [name for name in GROWTH if has_grown(name, [point.values[name] for point in points])]
     print(f"grown: {', '.join(grown)}" if grown else "flat: no figure of the last third is above that of the second")
     return not grown
 

@@ -73,8 +73,9 @@ pub use learning::{Learning, LearningState, Recordings};
 pub use live::{
     Acknowledgement, CameraActivity, CameraEvent, CameraEvents, ChangeNotices, EventId, ItemResult, Live,
     LiveStream, LossReason, LostEvents, LostSiteEvents, NotStored, NotStoredReason, Retraining, SinkFeed,
-    SinkFeeds, SinkPosition, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent, TargetUpdate,
-    TrackPoint, UnplacedBox, WantedEvents, WantedPositions, WorldSighting, WorldTrackPoint, WorldTracks,
+    SinkFeeds, SinkPosition, SiteClocks, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
+    TargetUpdate, TrackPoint, UnplacedBox, WantedEvents, WantedPositions, WorldSighting, WorldTrackPoint,
+    WorldTracks,
 };
 pub use matching::{
     Associations, GroupMember, MatchReport, MatchRequest, MatchedPair, MatchedRecording, SharedReceiver,

@@ -90,6 +90,7 @@ pub(super) fn evaluate(
     let mut tables = vec![
         report.table(),
         report.named_table(),
+        report.clock_table(),
         report.found_table(),
         report.crossing_table(),
         report.count_table(),
@@ -198,10 +199,16 @@ fn cases(recording: &SiteRecording) -> Vec<Case> {
 }
 
 /// All cameras trained together by the phones of another draw, without fixes and with them.
-fn cases_of_other_phones(together: &Case) -> [Case; 2] {
+fn cases_of_other_phones(together: &Case) -> [Case; 3] {
     [
-        ("together, other phones", Phones::Other),
-        ("together, other phones beside the boxes", Phones::OtherMatched),
+        ("together, other phones", Phones::Other, None),
+        ("together, other phones beside the boxes", Phones::OtherMatched, None),
+        ("the same, the phones late by 1 s", Phones::OtherMatched, Some(Degradation::LATE_RECEIVERS)),
     ]
-    .map(|(name, phones)| Case { name: name.to_owned(), phones, ..together.clone() })
+    .map(|(name, phones, degradation)| Case {
+        name: name.to_owned(),
+        phones,
+        degradation,
+        ..together.clone()
+    })
 }

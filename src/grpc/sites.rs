@@ -106,7 +106,9 @@ impl SiteService for Sites {
             Ok(proto::ListWorldTracksResponse {
                 tracks: tracks.points.iter().map(|point| point.as_ref().into()).collect(),
                 last_event_id: tracks.last_event.to_string(),
-                clocks: tracks.clocks.iter().map(Into::into).collect(),
+                clocks: tracks.clocks.cameras.iter().map(Into::into).collect(),
+                receiver_clocks: tracks.clocks.receivers.by_receiver.iter().map(Into::into).collect(),
+                common_receiver_clock: tracks.clocks.receivers.common.map(Into::into),
             })
         })
         .await

@@ -11,8 +11,8 @@ use super::proto::watch_tracks_response::Event;
 use super::statuses::to_status;
 use crate::admission::Lease;
 use crate::app::{LossReason, LostSiteEvents, SiteEventKind, SiteEvents, StoredSiteEvent, WorldTrackPoint};
-use crate::domain::{CameraId, Error, ErrorKind, SiteId};
-use crate::fusion::world::CameraClock;
+use crate::domain::{CameraId, Error, ErrorKind, ReceiverId, SiteId};
+use crate::fusion::clock_estimate::ClockEstimate;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 
@@ -122,14 +122,31 @@ impl From<LostSiteEvents> for proto::WatchTracksResponse {
     }
 }
 
-impl From<(&CameraId, &CameraClock)> for proto::CameraClock {
-    fn from((camera, clock): (&CameraId, &CameraClock)) -> Self {
+impl From<(&CameraId, &ClockEstimate)> for proto::CameraClock {
+    fn from((camera, clock): (&CameraId, &ClockEstimate)) -> Self {
         Self {
             camera_id: camera.to_string(),
             offset_s: clock.offset_s,
             sigma_s: clock.sigma_s,
             is_wrong: clock.is_wrong(),
         }
+    }
+}
+
+impl From<(&ReceiverId, &ClockEstimate)> for proto::ReceiverClock {
+    fn from((receiver, clock): (&ReceiverId, &ClockEstimate)) -> Self {
+        Self {
+            receiver_id: receiver.to_string(),
+            offset_s: clock.offset_s,
+            sigma_s: clock.sigma_s,
+            is_wrong: clock.is_wrong(),
+        }
+    }
+}
+
+impl From<ClockEstimate> for proto::CommonClock {
+    fn from(clock: ClockEstimate) -> Self {
+        Self { offset_s: clock.offset_s, sigma_s: clock.sigma_s, is_wrong: clock.is_wrong() }
     }
 }
 

@@ -6,6 +6,7 @@
 //! | [`two_step`] | confidences (6) (7) and the fusion of one box with one fix (8) |
 //! | [`pairing`] | which fix belongs to which box, by the times of both |
 //! | [`clock_offset`] | the offset between a receiver's clock and the camera's |
+//! | [`clock_estimate`] | how late a clock is, and from where on that is no chance |
 //! | [`association`] | which box shows the carrier of which receiver, where boxes have only the ids of a tracker |
 //! | [`track`], [`target_track`] | the filtered path of one target in one camera |
 //! | [`smoother`] | the paths of finished tracks |
@@ -22,6 +23,7 @@
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 pub mod association;
+pub mod clock_estimate;
 pub mod clock_offset;
 pub mod drift_detector;
 pub mod frame_assembler;

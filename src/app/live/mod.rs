@@ -66,8 +66,8 @@ pub(super) use retraining::RetrainSchedule;
 pub use retraining::Retraining;
 pub use sink_feeds::{SinkFeed, SinkFeeds, SinkPosition, WantedEvents, WantedPositions};
 pub use site::{
-    LossReason, LostSiteEvents, SiteEvent, SiteEventKind, SiteEvents, SiteTracks, StoredSiteEvent,
-    WorldSighting, WorldTrackPoint, WorldTracks,
+    LossReason, LostSiteEvents, SiteClocks, SiteEvent, SiteEventKind, SiteEvents, SiteTracks,
+    StoredSiteEvent, WorldSighting, WorldTrackPoint, WorldTracks,
 };
 pub(super) use stream::StreamSlots;
 pub use stream::{ChangeNotices, LiveStream};

@@ -17,9 +17,9 @@ use utoipa_axum::routes;
 
 use super::tracks::{KEEP_ALIVE, PointGeometry, ReceiverMatch, event_of};
 use crate::app::{LostSiteEvents, SiteEventKind, SiteTracks, StoredSiteEvent, WorldTrackPoint};
-use crate::domain::{CameraId, Error, LiveId, Result, TargetId};
+use crate::domain::{CameraId, Error, LiveId, ReceiverId, Result, TargetId};
 use crate::exchange::wire::{Motion, PlaneCovariance, Position};
-use crate::fusion::world;
+use crate::fusion::clock_estimate::ClockEstimate;
 use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::extract::{Client, Params, SitePath, WorldTrackPath, negotiate};
 use crate::http::plumbing::problem::{ApiResult, Problem};
@@ -139,14 +139,58 @@ struct CameraClock {
     is_wrong: bool,
 }
 
-impl From<(&CameraId, &world::CameraClock)> for CameraClock {
-    fn from((camera, clock): (&CameraId, &world::CameraClock)) -> Self {
+impl From<(&CameraId, &ClockEstimate)> for CameraClock {
+    fn from((camera, clock): (&CameraId, &ClockEstimate)) -> Self {
         Self {
             camera_id: camera.to_string(),
             offset_s: clock.offset_s,
             sigma_s: clock.sigma_s,
             is_wrong: clock.is_wrong(),
         }
+    }
+}
+
+/// How late the times of a receiver are beside those of the cameras of a site.
+#[derive(Serialize, ToSchema)]
+struct ReceiverClock {
+    /// The receiver's id.
+    receiver_id: String,
+    /// Seconds by which its times, with its `clock_offset_s` added, are later than those of the cameras; negative if they are
+    /// earlier.
+    offset_s: f64,
+    /// Standard deviation of the estimate, s.
+    sigma_s: f64,
+    /// True if the offset is no chance: world tracks correct the receiver's times by it. Where `common_receiver_clock` is wrong as
+    /// well, the cameras' clocks should be set; else subtract it from the receiver's `clock_offset_s`.
+    is_wrong: bool,
+}
+
+impl From<(&ReceiverId, &ClockEstimate)> for ReceiverClock {
+    fn from((receiver, clock): (&ReceiverId, &ClockEstimate)) -> Self {
+        Self {
+            receiver_id: receiver.to_string(),
+            offset_s: clock.offset_s,
+            sigma_s: clock.sigma_s,
+            is_wrong: clock.is_wrong(),
+        }
+    }
+}
+
+/// How late the times of most receivers of a site are beside those of its cameras.
+#[derive(Serialize, ToSchema)]
+struct CommonClock {
+    /// Seconds by which they are later; negative if they are earlier, so that the cameras' times are late.
+    offset_s: f64,
+    /// Standard deviation of the estimate, s.
+    sigma_s: f64,
+    /// True if the offset is no chance. Receivers have the time of GNSS: world tracks correct all of their times by it, and the
+    /// cameras' clocks should be set.
+    is_wrong: bool,
+}
+
+impl From<ClockEstimate> for CommonClock {
+    fn from(clock: ClockEstimate) -> Self {
+        Self { offset_s: clock.offset_s, sigma_s: clock.sigma_s, is_wrong: clock.is_wrong() }
     }
 }
 
@@ -162,6 +206,13 @@ struct WorldTracks {
     /// one track.
     #[serde(skip_serializing_if = "Option::is_none")]
     clocks: Option<Vec<CameraClock>>,
+    /// How late the times of receivers are beside those of the cameras, by receiver, where tracks of their carriers tell; missing
+    /// for one track.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    receiver_clocks: Option<Vec<ReceiverClock>>,
+    /// The same of most receivers together; missing where fewer than three tell.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    common_receiver_clock: Option<CommonClock>,
 }
 
 /// A position of a world track as a GeoJSON feature (RFC 7946).
@@ -204,7 +255,10 @@ fn answer(headers: &HeaderMap, points: &[Arc<WorldTrackPoint>], of_site: Option<
         Form::Json => json(&WorldTracks {
             items: points.iter().map(|point| point.as_ref().into()).collect(),
             last_event_id: of_site.map(|tracks| tracks.last_event.to_string()),
-            clocks: of_site.map(|tracks| tracks.clocks.iter().map(Into::into).collect()),
+            receiver_clocks: of_site
+                .map(|tracks| tracks.clocks.receivers.by_receiver.iter().map(Into::into).collect()),
+            common_receiver_clock: of_site.and_then(|tracks| tracks.clocks.receivers.common.map(Into::into)),
+            clocks: of_site.map(|tracks| tracks.clocks.cameras.iter().map(Into::into).collect()),
         })?,
         Form::GeoJson => {
             let features = points.iter().map(|point| point.as_ref().into()).collect();

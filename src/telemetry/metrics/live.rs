@@ -14,6 +14,7 @@ pub(super) struct LiveMetrics {
     pub(super) item_errors: Counter,
     pub(super) answers_lost: Counter,
     pub(super) cameras_moved: Counter,
+    pub(super) clocks_wrong: Counter,
     pub(super) place_measurements_dropped: Counter,
     pub(super) place_messages_dropped: Counter,
     pub(super) finished_tracks_dropped: Counter,
@@ -93,6 +94,11 @@ impl LiveMetrics {
             cameras_moved: registry.counter(
                 "sightfix_cameras_moved_total",
                 "Alarms that a camera was moved",
+                &[],
+            ),
+            clocks_wrong: registry.counter(
+                "sightfix_clocks_wrong_total",
+                "Clocks of cameras and receivers of sites that were found to be wrong",
                 &[],
             ),
             finished_tracks_dropped: registry.counter(

@@ -186,6 +186,11 @@ impl Metrics {
         self.live.cameras_moved.increment(1);
     }
 
+    /// So many clocks of a site have become wrong.
+    pub fn clocks_wrong(&self, clocks: usize) {
+        self.live.clocks_wrong.increment(clocks as u64);
+    }
+
     /// Number of processes that share the database.
     pub fn nodes(&self, nodes: usize) {
         self.cluster.nodes.set(nodes as f64);

@@ -77,6 +77,15 @@ async fn trained_yard(folder: &std::path::Path) -> TestServer {
     server
 }
 
+/// The same as a camera of the site `square`.
+async fn trained_yard_of_site(folder: &std::path::Path) -> TestServer {
+    let server = trained_yard(folder).await;
+    server.post("/v1/sites", &json!({"id": "square"})).await.expect(201);
+    let headers = [("content-type", "application/json"), ("if-match", "*")];
+    server.send("PATCH", "/v1/cameras/yard", &headers, r#"{"site": "square"}"#).await.expect(200);
+    server
+}
+
 fn item(row: &Row, shift: SignedDuration) -> proto::StreamItem {
     let time = time(row.time + shift);
     match (row.walker, &row.numbers[..]) {
@@ -195,10 +204,7 @@ async fn boxes_of_a_stream_are_matched_with_the_receivers_beside_them() {
 #[tokio::test]
 async fn a_world_track_keeps_its_id_when_its_receiver_is_found() {
     let folder = data_folder();
-    let server = trained_yard(folder.path()).await;
-    server.post("/v1/sites", &json!({"id": "square"})).await.expect(201);
-    let headers = [("content-type", "application/json"), ("if-match", "*")];
-    server.send("PATCH", "/v1/cameras/yard", &headers, r#"{"site": "square"}"#).await.expect(200);
+    let server = trained_yard_of_site(folder.path()).await;
     let mut client = open(&channel(&server).await, "edge", false).await;
     let rows = rows(&LIVE.recorded());
     let (first, last) = (rows[0].time, rows.last().expect("rows").time);
@@ -221,6 +227,41 @@ async fn a_world_track_keeps_its_id_when_its_receiver_is_found() {
         assert_eq!(carried[0]["target_id"], phone, "{tracks}");
         assert!(carried[0]["receiver_match"]["probability"].as_f64() >= Some(0.6), "{tracks}");
     }
+}
+
+/// The camera's clock is early by 1.5 s: the fixes of all receivers seem late by that.
+#[tokio::test]
+async fn receivers_that_are_all_late_show_that_the_clocks_of_the_cameras_are_early() {
+    const LATE: SignedDuration = SignedDuration::from_millis(1_500);
+    let folder = data_folder();
+    let server = trained_yard_of_site(folder.path()).await;
+    let mut client = open(&channel(&server).await, "edge", false).await;
+    let mut rows = rows(&Crowd { phones: LIVE.walkers, ..LIVE }.recorded());
+    rows.iter_mut().filter(|row| row.walker.is_none()).for_each(|row| row.time += LATE);
+    rows.sort_by_key(|row| row.time);
+    let shift = now().duration_since(rows.last().expect("rows").time);
+    for row in &rows {
+        sent(&mut client, item(row, shift)).await;
+    }
+    // Rounds of matching go on beside the stream.
+    let latest = rows.iter().rfind(|row| row.walker.is_some()).expect("a box");
+    let mut answer = Value::Null;
+    for attempt in 1..=150 {
+        sent(&mut client, item(latest, shift + LATE + SignedDuration::from_millis(attempt))).await;
+        answer = server.get("/v1/sites/square/tracks").await.expect(200).json();
+        if answer["common_receiver_clock"]["is_wrong"] == true {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    }
+    let late = |clock: &Value| {
+        let figure = |name: &str| clock[name].as_f64().expect("a figure");
+        (figure("offset_s") - LATE.as_secs_f64()).abs() <= 4.0 * figure("sigma_s")
+    };
+    assert!(answer["common_receiver_clock"]["is_wrong"] == true, "{answer}");
+    assert!(late(&answer["common_receiver_clock"]), "{answer}");
+    let single = answer["receiver_clocks"].as_array().expect("clocks");
+    assert!(single.len() >= 3 && single.iter().all(late), "{answer}");
 }
 
 /// All samples of the camera.

@@ -1,4 +1,4 @@
-//! Worse detections than those recorded: missed ones, false ones, ids that swap, a clock that is late, and a camera that is knocked.
+//! Worse detections than those recorded: missed ones, false ones, ids that swap, clocks that are late, and a camera that is knocked.
 
 use std::collections::BTreeMap;
 
@@ -20,18 +20,28 @@ pub struct Degradation {
     pub swap_s: f64,
     /// Time by which the first camera's clock is late, s.
     pub late_s: f64,
+    /// Time by which the clocks of all receivers are late, s.
+    pub receivers_late_s: f64,
     /// What the first camera's boxes are moved by towards the right from the middle of the recording on, in image widths.
     pub knock: f64,
 }
 
 impl Degradation {
     /// No fault.
-    const NONE: Self =
-        Self { missed_share: 0.0, false_per_frame: 0.0, swap_s: f64::INFINITY, late_s: 0.0, knock: 0.0 };
+    const NONE: Self = Self {
+        missed_share: 0.0,
+        false_per_frame: 0.0,
+        swap_s: f64::INFINITY,
+        late_s: 0.0,
+        receivers_late_s: 0.0,
+        knock: 0.0,
+    };
     /// 10 % missed, a false detection in every second frame, a swap every ten seconds.
     pub const ROUGH: Self = Self { missed_share: 0.1, false_per_frame: 0.5, swap_s: 10.0, ..Self::NONE };
     /// The first camera's clock is late by half a second.
     pub const LATE: Self = Self { late_s: 0.5, ..Self::NONE };
+    /// All receivers are late by a second.
+    pub const LATE_RECEIVERS: Self = Self { receivers_late_s: 1.0, ..Self::NONE };
     /// The first camera is turned by 60 px of an image 1,920 px wide, and by 200 px.
     pub const KNOCKED: Self = Self { knock: 60.0 / 1_920.0, ..Self::NONE };
     /// See [`Self::KNOCKED`].
@@ -46,10 +56,13 @@ impl Degradation {
             random.set_stream(index as u64);
             self.degrade(camera, recording.image_size, &mut random);
         }
-        let late = SignedDuration::try_from_secs_f64(self.late_s).unwrap_or_default();
-        for labelled in degraded.cameras.iter_mut().take(1).flat_map(|camera| &mut camera.boxes) {
-            labelled.time = labelled.time.saturating_add(late).unwrap_or(labelled.time);
-        }
+        let later = |time: &mut Timestamp, late_s: f64| {
+            let late = SignedDuration::try_from_secs_f64(late_s).unwrap_or_default();
+            *time = time.saturating_add(late).unwrap_or(*time);
+        };
+        let first = degraded.cameras.iter_mut().take(1).flat_map(|camera| &mut camera.boxes);
+        first.for_each(|labelled| later(&mut labelled.time, self.late_s));
+        degraded.fixes.iter_mut().for_each(|fix| later(&mut fix.time, self.receivers_late_s));
         self.knock(&mut degraded);
         degraded
     }

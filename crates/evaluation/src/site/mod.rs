@@ -4,6 +4,7 @@
 //! Definitions are in docs/explanation/world-tracks.md, with their sources.
 
 mod box_figures;
+mod clock_figures;
 mod crossing_figures;
 mod degradation;
 mod draw;
@@ -20,6 +21,7 @@ mod tests;
 mod world_figures;
 
 pub use box_figures::{BoxFigures, BoxRecord};
+pub use clock_figures::{ClockFigures, EstimateFigures};
 pub use crossing_figures::{CrossingFigures, PlaceCounts};
 pub use degradation::Degradation;
 pub use draw::position_at;

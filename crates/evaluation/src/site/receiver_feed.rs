@@ -7,6 +7,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
+use super::clock_figures::ClockFigures;
 use super::recording::{LabelledBox, RecordedFix, SiteRecording};
 use crate::domain::ReceiverId;
 use crate::fusion::association::{Cancellation, LiveMatchSettings, WorldReceiverWindow};
@@ -28,9 +29,9 @@ pub struct NamedFigures {
     pub right: usize,
     /// Boxes of carriers.
     pub carried: usize,
-    /// Boxes on tracks that had a receiver at some time, as a reader of finished tracks sees them.
+    /// Boxes on tracks that have a receiver by the last round, whose window may hold the whole recording.
     pub named_in_hindsight: usize,
-    /// Those of them whose target carries the receiver that its track had for most boxes.
+    /// Those of them whose target carries it.
     pub right_in_hindsight: usize,
 }
 
@@ -61,40 +62,30 @@ impl NamedFigures {
     }
 }
 
-/// Boxes of a track: by target, and by the carrier of the receiver that it had then.
-#[derive(Default)]
-struct TrackBoxes {
-    targets: BTreeMap<Option<usize>, usize>,
-    carriers: BTreeMap<usize, usize>,
-}
-
-impl TrackBoxes {
-    /// Boxes, and those of the carrier, if the track had a receiver.
-    fn in_hindsight(&self) -> Option<(usize, usize)> {
-        let (carrier, _) = self.carriers.iter().max_by_key(|(_, boxes)| **boxes)?;
-        Some((self.targets.values().sum(), self.targets.get(&Some(*carrier)).copied().unwrap_or_default()))
-    }
-}
-
 /// Feeds the fixes of a recording to its tracker in the order of time.
 pub(super) struct ReceiverFeed<'a> {
     recording: &'a SiteRecording,
     /// Fixes that are yet to come, in the order of time.
     rest: &'a [RecordedFix],
     carriers: BTreeMap<&'a ReceiverId, usize>,
+    /// Probability from which on a track has a receiver.
+    matched_from: f64,
     window: WorldReceiverWindow,
     next_round: Option<Timestamp>,
     figures: NamedFigures,
-    tracks: BTreeMap<WorldTrackId, TrackBoxes>,
+    /// Boxes of each track by target.
+    tracks: BTreeMap<WorldTrackId, BTreeMap<Option<usize>, usize>>,
 }
 
 impl<'a> ReceiverFeed<'a> {
     pub(super) fn new(recording: &'a SiteRecording) -> Self {
+        let settings = LiveMatchSettings::of_site();
         Self {
             recording,
             rest: &recording.fixes,
+            matched_from: settings.matched_from,
             carriers: recording.receivers.iter().map(|(id, target)| (id, *target)).collect(),
-            window: WorldReceiverWindow::new(LiveMatchSettings::of_site()),
+            window: WorldReceiverWindow::new(settings),
             next_round: None,
             figures: NamedFigures::default(),
             tracks: BTreeMap::new(),
@@ -108,7 +99,8 @@ impl<'a> ReceiverFeed<'a> {
         for fix in now {
             let receiver = &self.recording.receivers[fix.receiver].0;
             self.window.observe_fix(receiver, fix.time, fix.position, None);
-            tracker.observe_fix(receiver, fix.time, fix.position, FIX_SIGMA_M);
+            let time = self.window.corrected(receiver, fix.time);
+            tracker.observe_fix(receiver, time, fix.position, FIX_SIGMA_M);
         }
         if self.next_round.is_none_or(|next| time >= next) {
             self.next_round = time.checked_add(ROUND).ok();
@@ -126,11 +118,7 @@ impl<'a> ReceiverFeed<'a> {
         for (labelled, track) in boxes.iter().zip(&outcome.tracks) {
             let carrier = track.and_then(|track| self.carrier_of(tracker, track));
             if let Some(track) = track {
-                let own = self.tracks.entry(*track).or_default();
-                *own.targets.entry(labelled.target).or_default() += 1;
-                if let Some(carrier) = carrier {
-                    *own.carriers.entry(carrier).or_default() += 1;
-                }
+                *self.tracks.entry(*track).or_default().entry(labelled.target).or_default() += 1;
             }
             let is_carrier = |target: &usize| self.carriers.values().any(|carrier| carrier == target);
             self.figures = self.figures.plus(NamedFigures {
@@ -147,13 +135,23 @@ impl<'a> ReceiverFeed<'a> {
         self.carriers.get(&tracker.track(track)?.receiver_match()?.receiver_id).copied()
     }
 
+    /// The receivers' clocks, all of which are late by so much, s.
+    pub(super) fn clock_figures(&self, late_s: f64) -> ClockFigures {
+        ClockFigures::of(self.window.clocks(), late_s)
+    }
+
     pub(super) fn figures(self) -> NamedFigures {
-        self.tracks.values().filter_map(TrackBoxes::in_hindsight).fold(self.figures, |sum, (named, right)| {
-            sum.plus(NamedFigures {
-                named_in_hindsight: named,
-                right_in_hindsight: right,
+        let mut random = ChaCha8Rng::seed_from_u64(SEED);
+        let last = self.window.matched(&mut random, Cancellation::NEVER).unwrap_or_default();
+        let sure = last.receivers.iter().filter(|(_, own)| own.probability >= self.matched_from);
+        let in_hindsight = sure.filter_map(|(track, own)| {
+            let (boxes, carrier) = (self.tracks.get(track)?, self.carriers.get(&own.receiver_id)?);
+            Some(NamedFigures {
+                named_in_hindsight: boxes.values().sum(),
+                right_in_hindsight: boxes.get(&Some(*carrier)).copied().unwrap_or_default(),
                 ..NamedFigures::default()
             })
-        })
+        });
+        in_hindsight.fold(self.figures, NamedFigures::plus)
     }
 }

@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
+use super::clock_figures::ClockFigures;
 use super::crossing_figures::{CrossingFigures, PlaceCounts};
 use super::receiver_feed::NamedFigures;
 use super::runner::{FoundCamera, SiteOutcome};
@@ -36,6 +37,8 @@ pub struct SiteCase {
     pub coverage95: Option<f64>,
     /// Receivers of tracks, over all draws, where fixes came.
     pub named: Option<NamedFigures>,
+    /// The clocks of receivers at the ends of all draws, likewise.
+    pub receiver_clocks: Option<ClockFigures>,
     /// Crossings of lines over the area, over all draws.
     pub crossings: Option<CrossingFigures>,
     /// Counts of lines over the area and of its middle, in the first draw.
@@ -110,6 +113,7 @@ impl SiteCase {
             mean_error_by_all_m: None,
             coverage95: optional(&|it| it.positions.map(|positions| positions.coverage95)),
             named: outcomes.iter().filter_map(|it| it.named).reduce(NamedFigures::plus),
+            receiver_clocks: outcomes.iter().filter_map(|it| it.receiver_clocks).reduce(ClockFigures::plus),
             crossings: CrossingFigures::over_draws(outcomes.iter().filter_map(|it| it.crossings)),
             counts: outcomes.first().map(|it| it.counts.clone()).unwrap_or_default(),
             wrong_clocks: FoundCameraFigures::over_draws(outcomes, |it| &it.wrong_clocks),
@@ -239,6 +243,27 @@ impl SiteReport {
                     case.name, case.draws
                 );
             }
+        }
+        table
+    }
+
+    /// The estimated clocks of receivers as a Markdown table; empty where no fixes came.
+    #[must_use]
+    pub fn clock_table(&self) -> String {
+        let mut table = String::new();
+        for (name, clocks) in self.cases.iter().filter_map(|case| Some((&case.name, case.receiver_clocks?))) {
+            if table.is_empty() {
+                table.push_str(
+                    "| case | receivers with an estimate | error s | in standard deviations | called wrong | in common: draws | \
+                     error s | in standard deviations | called wrong |\n|---|---|---|---|---|---|---|---|---|\n",
+                );
+            }
+            let cells = [clocks.single, clocks.common].map(|own| {
+                let [error_s, in_sigmas] = own.root_mean_squares();
+                format!("{} | {error_s:.2} | {in_sigmas:.2} | {}", own.count, own.called_wrong)
+            });
+            // Writing to a string cannot fail.
+            let _ = writeln!(table, "| {name} | {} |", cells.join(" | "));
         }
         table
     }

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use jiff::Timestamp;
 
 use super::box_figures::{BoxFigures, BoxRecord};
+use super::clock_figures::ClockFigures;
 use super::crossing_figures::{CrossingFigures, CrossingRecorder, PlaceCounts};
 use super::receiver_feed::{NamedFigures, ReceiverFeed};
 use super::recording::{LabelledBox, RecordedFix, SiteRecording};
@@ -57,6 +58,8 @@ pub struct SiteOutcome {
     pub counts: Vec<PlaceCounts>,
     /// The receivers of tracks, where fixes came.
     pub named: Option<NamedFigures>,
+    /// The clocks of receivers at the end, likewise.
+    pub receiver_clocks: Option<ClockFigures>,
     /// Errors of the positions.
     pub positions: Option<PositionFigures>,
     /// The same of the targets that one camera of the recording sees, by camera.
@@ -267,12 +270,16 @@ pub fn track_site(
         }
         instants.push(WorldInstant { targets, tracks });
     }
+    let first_fix = |of: &SiteRecording| of.fixes.first().map(|fix| fix.time);
+    let late = first_fix(recording).zip(first_fix(visible)).map(|(own, visible)| own.duration_since(visible));
+    let late_s = late.unwrap_or_default().as_secs_f64();
     let (crossings, counts) = crossings.map(CrossingRecorder::figures).unwrap_or_default();
     SiteOutcome {
         boxes: BoxFigures::of(&records),
         world: WorldFigures::of(&instants),
         crossings,
         counts,
+        receiver_clocks: receivers.as_ref().map(|receivers| receivers.clock_figures(late_s)),
         named: receivers.map(ReceiverFeed::figures),
         positions: PositionFigures::of(&instants),
         positions_in_view: instants_in_view.iter().map(|own| PositionFigures::of(own)).collect(),

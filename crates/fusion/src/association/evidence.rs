@@ -40,7 +40,7 @@ pub(super) struct EvidenceModel {
 
 impl EvidenceModel {
     /// Variance of a receiver's bias per axis, m2: the larger of what the receiver states and what is assumed.
-    fn bias_m2(&self, fix: &TimedFix) -> f64 {
+    pub(super) fn bias_m2(&self, fix: &TimedFix) -> f64 {
         self.gnss.coloured_variance_m2().max(fix.stated_variance_m2.unwrap_or(0.0))
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! [`match_with_model`] compares fixes with regressed positions; [`match_without_model`] finds the camera,
 //! too. `docs/explanation/association.md` has the formulas and figures. The files in the order of their imports:
-//! `cancellation`, `tracklet`, `disjoint`, `axis_filter`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`, `world_receivers`.
+//! `cancellation`, `tracklet`, `disjoint`, `axis_filter`, `evidence`, `links`, `chains`, `assignment`, `cuts`, `companions`, `placement`, `recording`, `matching`, `joint`, `live`, `receiver_clocks`, `world_receivers`.
 //! Does not use I/O, clocks, or randomness that is not handed in.
 
 mod assignment;
@@ -20,6 +20,7 @@ mod links;
 mod live;
 mod matching;
 mod placement;
+mod receiver_clocks;
 mod recording;
 mod tracklet;
 mod world_receivers;
@@ -31,7 +32,8 @@ pub use self::live::{LiveMatchSettings, LiveMatches, LiveWindow};
 pub use self::matching::{
     MatchLimits, MatchSettings, MatchedGroup, MatchedPiece, Matching, match_with_model,
 };
-pub use self::world_receivers::{WorldReceiverWindow, WorldReceivers};
+pub use self::receiver_clocks::ReceiverClocks;
+pub use self::world_receivers::{MatchedReceivers, WorldReceiverWindow, WorldReceivers};
 
 #[cfg(test)]
 mod tests;

@@ -57,9 +57,14 @@ impl Tracklet {
 
     /// The position at an instant on the straight line between neighbours at most `max_gap_s` apart.
     pub(super) fn at(&self, time_s: f64, max_gap_s: f64) -> Option<TrackPoint> {
-        let next = self.points.partition_point(|point| point.time_s < time_s);
-        let after = self.points.get(next)?;
-        let Some(before) = next.checked_sub(1).map(|at| &self.points[at]) else {
+        Self::between(&self.points, time_s, max_gap_s)
+    }
+
+    /// The same of some points.
+    pub(super) fn between(points: &[TrackPoint], time_s: f64, max_gap_s: f64) -> Option<TrackPoint> {
+        let next = points.partition_point(|point| point.time_s < time_s);
+        let after = points.get(next)?;
+        let Some(before) = next.checked_sub(1).map(|at| &points[at]) else {
             return (after.time_s <= time_s).then_some(*after);
         };
         let gap_s = after.time_s - before.time_s;

@@ -17,6 +17,7 @@ use super::companions::missed_companion_factor;
 use super::evidence::EvidenceModel;
 use super::live::LiveMatchSettings;
 use super::matching::{LEAST_WHITE_SIGMA_M, piece_posterior};
+use super::receiver_clocks::{CarriedFixes, ReceiverClocks};
 use super::tracklet::{SceneMotion, TimedFix, TrackPoint, Tracklet};
 use crate::domain::{GaussMarkovNoise, ReceiverId, ReceiverMatch, Result};
 use crate::geo::EastNorth;
@@ -24,6 +25,15 @@ use crate::world::{FrameOutcome, WorldEvent, WorldTrack, WorldTrackId, WorldTrac
 
 /// The receivers of world tracks by their latest round.
 pub type WorldReceivers = BTreeMap<WorldTrackId, ReceiverMatch>;
+
+/// The findings of a round.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct MatchedReceivers {
+    /// The most probable receiver of each track as it is now.
+    pub receivers: WorldReceivers,
+    /// How late the receivers' clocks are.
+    pub clocks: ReceiverClocks,
+}
 
 /// Position of a track at an instant with the variances per axis of its noise and of its lasting error, m2.
 #[derive(Debug, Clone, Copy)]
@@ -51,6 +61,7 @@ pub struct WorldReceiverWindow {
     /// Time of the latest frame.
     latest: Option<Timestamp>,
     receivers: WorldReceivers,
+    clocks: ReceiverClocks,
 }
 
 impl WorldReceiverWindow {
@@ -63,6 +74,7 @@ impl WorldReceiverWindow {
             fixes: BTreeMap::new(),
             latest: None,
             receivers: WorldReceivers::new(),
+            clocks: ReceiverClocks { by_receiver: BTreeMap::new(), common: None },
         }
     }
 
@@ -82,7 +94,7 @@ impl WorldReceiverWindow {
         }
     }
 
-    /// Takes a fix in, by the cameras' clock. Before the first frame there is nothing to be matched with.
+    /// Takes a fix in under the time that its receiver states. Before the first frame there is nothing to be matched with.
     pub fn observe_fix(
         &mut self,
         receiver_id: &ReceiverId,
@@ -116,14 +128,28 @@ impl WorldReceiverWindow {
         &self.receivers
     }
 
-    /// The most probable receiver of each track as it is now.
+    /// The receivers' clocks by the latest round.
+    #[must_use]
+    pub const fn clocks(&self) -> &ReceiverClocks {
+        &self.clocks
+    }
+
+    /// A receiver's time by the cameras' clock.
+    #[must_use]
+    pub fn corrected(&self, receiver: &ReceiverId, time: Timestamp) -> Timestamp {
+        let late = SignedDuration::try_from_secs_f64(self.clocks.corrected_s(receiver)).unwrap_or_default();
+        time.checked_sub(late).unwrap_or(time)
+    }
+
+    /// The most probable receiver of each track as it is now, and the receivers' clocks.
     ///
     /// # Errors
     /// `Cancelled`.
-    pub fn matched(&self, random: &mut impl Rng, cancellation: Cancellation<'_>) -> Result<WorldReceivers> {
+    pub fn matched(&self, random: &mut impl Rng, cancellation: Cancellation<'_>) -> Result<MatchedReceivers> {
         let tracklets: Vec<Tracklet> = self.tracks.values().map(|own| self.tracklet(own)).collect();
         let fixes: Vec<Vec<TimedFix>> = self.fixes.values().map(|own| self.timed(own)).collect();
-        let timed: Vec<(&[TimedFix], f64)> = fixes.iter().map(|own| (own.as_slice(), 0.0)).collect();
+        let corrections_s = self.fixes.keys().map(|receiver| -self.clocks.corrected_s(receiver));
+        let timed: Vec<(&[TimedFix], f64)> = fixes.iter().map(Vec::as_slice).zip(corrections_s).collect();
         let gnss = GaussMarkovNoise::PHONE.with_white_at_least(LEAST_WHITE_SIGMA_M * LEAST_WHITE_SIGMA_M);
         let model = EvidenceModel { gnss, motion: SceneMotion::of(&tracklets) };
         let posterior =
@@ -138,11 +164,23 @@ impl WorldReceiverWindow {
             let probability = own.probability * missed_companion_factor();
             (*tracks[own.piece.tracklet], ReceiverMatch { receiver_id, probability })
         });
-        Ok(matched.collect())
+        let clock = |(receiver, own): (&ReceiverId, usize)| {
+            let pieces = posterior
+                .owned()
+                .filter(|piece| piece.receiver == own && piece.probability >= self.settings.matched_from);
+            let pieces: Vec<&[TrackPoint]> = pieces
+                .map(|own| &tracklets[own.piece.tracklet].points[own.piece.first..own.piece.end])
+                .collect();
+            let carried = CarriedFixes { pieces: &pieces, fixes: &fixes[own] };
+            Some((receiver.clone(), carried.clock(&model)?))
+        };
+        let clocks = self.fixes.keys().zip(0..).filter_map(clock).collect();
+        Ok(MatchedReceivers { receivers: matched.collect(), clocks: ReceiverClocks::new(clocks) })
     }
 
     /// Takes the findings of a round over: a match begins when it is sure, and stays until it is unlikely.
-    pub fn accept(&mut self, matched: WorldReceivers) {
+    pub fn accept(&mut self, MatchedReceivers { receivers: matched, clocks }: MatchedReceivers) {
+        self.clocks = clocks;
         let before = std::mem::take(&mut self.receivers);
         let is_held = |id: &WorldTrackId, own: &ReceiverMatch| {
             before.get(id).is_some_and(|held| held.receiver_id == own.receiver_id)
@@ -234,7 +272,6 @@ impl WorldReceiverWindow {
 
 #[cfg(test)]
 mod tests {
-    use rand::SeedableRng as _;
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
@@ -284,36 +321,63 @@ mod tests {
         CameraFrame { camera, time: at_s(seconds), detections: detections.collect() }
     }
 
-    #[test]
-    fn world_tracks_are_matched_with_the_receivers_of_their_targets() {
+    /// A tracker and a window after two minutes of walking, with phones whose times are late by so much, s; and the last frame's
+    /// tracks.
+    fn walked(late_s: &[f64], seed: u64) -> (WorldTracker, WorldReceiverWindow, FrameOutcome) {
         let origin = Position::new(11.0, 48.0).expect("within range");
         let mut tracker = WorldTracker::new(LocalPlane::new(origin), WorldTrackSettings::default());
         let mut window = WorldReceiverWindow::new(LiveMatchSettings::of_site());
-        let mut phones: Vec<SimulatedReceiver> = (0..PHONES)
-            .map(|own| SimulatedReceiver::seeded(GaussMarkovNoise::PHONE, 7, own as u64))
-            .collect();
-        let (mut random, mut last) = (stream(5, 0), FrameOutcome::default());
+        let phone = |own: usize| SimulatedReceiver::seeded(GaussMarkovNoise::PHONE, seed, own as u64);
+        let mut phones: Vec<SimulatedReceiver> = (0..late_s.len()).map(phone).collect();
+        let (mut random, mut last) = (stream(seed, 1_000), FrameOutcome::default());
         for step in 0..240 {
             last = tracker.observe(&frame(step, &mut random));
             window.observe(&tracker, &last);
+            if step % 20 == 0 {
+                let matched = window.matched(&mut random, Cancellation::NEVER).expect("never cancelled");
+                window.accept(matched);
+            }
             for (walker, phone) in phones.iter_mut().enumerate().filter(|_| step % 2 == 0) {
                 let seconds = 0.5 * f64::from(step);
-                window.observe_fix(
-                    &receiver_id(walker),
-                    at_s(seconds),
-                    phone.measure(position(walker, seconds), 1.0),
-                    None,
-                );
+                let measured = phone.measure(position(walker, seconds - late_s[walker]), 1.0);
+                window.observe_fix(&receiver_id(walker), at_s(seconds), measured, None);
             }
         }
-        let mut random = ChaCha8Rng::seed_from_u64(1);
-        window.accept(window.matched(&mut random, Cancellation::NEVER).expect("never cancelled"));
         tracker.set_receiver_matches(window.receivers());
+        (tracker, window, last)
+    }
+
+    #[test]
+    fn world_tracks_are_matched_with_the_receivers_of_their_targets() {
+        let (tracker, _, last) = walked(&[0.0; PHONES], 7);
         for (walker, track) in last.tracks.iter().enumerate() {
             let track = tracker.track(track.expect("assigned")).expect("live");
             let found = track.receiver_match().map(|own| own.receiver_id.clone());
             assert_eq!(found, (walker < PHONES).then(|| receiver_id(walker)), "walker {walker}");
         }
+    }
+
+    #[test]
+    fn clocks_are_found_late_as_far_as_walks_tell_and_what_all_have_in_common_is_the_cameras() {
+        let (mut squares, mut count) = (0.0, 0.0);
+        for seed in 1..=3 {
+            for (late_s, is_common) in
+                [([0.0; 5], false), ([0.0, 0.0, 0.0, 0.0, 1.5], false), ([-2.0; 5], true)]
+            {
+                let (_, window, _) = walked(&late_s, seed);
+                let clocks = window.clocks();
+                for (walker, late_s) in late_s.iter().enumerate() {
+                    let own = clocks.by_receiver[&receiver_id(walker)];
+                    squares += ((own.offset_s - late_s) / own.sigma_s).powi(2);
+                    count += 1.0;
+                    let corrected_s = clocks.corrected_s(&receiver_id(walker));
+                    assert!((corrected_s - late_s).abs() < 0.5, "{seed}, {walker}: {own:?}, {corrected_s}");
+                }
+                assert_eq!(clocks.common.is_some_and(|common| common.is_wrong()), is_common, "{seed}");
+            }
+        }
+        let in_sigmas: f64 = (squares / count).sqrt();
+        assert!((0.7..1.3).contains(&in_sigmas), "{in_sigmas}");
     }
 
     #[test]

@@ -19,36 +19,16 @@ use nalgebra::{DMatrix, DVector};
 
 use super::comparisons::{CameraPair, Comparisons, Overlap};
 use super::map_difference::Effects;
+use crate::clock_estimate::ClockEstimate;
 use crate::domain::CameraId;
-
-/// An offset is wrong, and corrected, beyond this one, s, and that many standard deviations.
-const LEAST_WRONG_S: f64 = 0.2;
-const SIGNIFICANT: f64 = 4.0;
-
-/// How late the times of a camera are.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CameraClock {
-    /// Seconds by which the camera's times are later than those of most cameras.
-    pub offset_s: f64,
-    /// Standard deviation of the estimate, s.
-    pub sigma_s: f64,
-}
-
-impl CameraClock {
-    /// True if the offset is neither chance nor a difference of two maps. The times of the camera's frames are corrected by it.
-    #[must_use]
-    pub fn is_wrong(&self) -> bool {
-        self.offset_s.abs() > LEAST_WRONG_S.max(SIGNIFICANT * self.sigma_s)
-    }
-}
 
 /// Estimates of the clocks of a site's cameras.
 #[derive(Debug, Clone, Default)]
-pub(super) struct CameraClocks(BTreeMap<CameraId, CameraClock>);
+pub(super) struct CameraClocks(BTreeMap<CameraId, ClockEstimate>);
 
 impl CameraClocks {
     /// The estimates so far.
-    pub(super) const fn clocks(&self) -> &BTreeMap<CameraId, CameraClock> {
+    pub(super) const fn clocks(&self) -> &BTreeMap<CameraId, ClockEstimate> {
         &self.0
     }
 
@@ -78,7 +58,7 @@ fn slope(overlap: &Overlap) -> Option<(f64, f64)> {
 }
 
 /// The clocks of all cameras that pairs tell of.
-fn solved(overlaps: &BTreeMap<CameraPair, Overlap>) -> BTreeMap<CameraId, CameraClock> {
+fn solved(overlaps: &BTreeMap<CameraPair, Overlap>) -> BTreeMap<CameraId, ClockEstimate> {
     let slopes: Vec<(&CameraPair, (f64, f64))> =
         overlaps.iter().filter_map(|(pair, own)| Some((pair, slope(own)?))).collect();
     let mut cameras: Vec<&CameraId> = slopes.iter().flat_map(|((one, other), _)| [one, other]).collect();
@@ -119,7 +99,7 @@ fn solved(overlaps: &BTreeMap<CameraPair, Overlap>) -> BTreeMap<CameraId, Camera
         let offset_s = offsets_s[camera] - offsets_s[median];
         let variance_s2 =
             covariance[(camera, camera)] + covariance[(median, median)] - 2.0 * covariance[(camera, median)];
-        CameraClock { offset_s, sigma_s: (inflation * variance_s2.max(0.0)).sqrt() }
+        ClockEstimate { offset_s, sigma_s: (inflation * variance_s2.max(0.0)).sqrt() }
     };
     cameras.iter().map(|camera| (*camera).clone()).zip((0..count).map(clock)).collect()
 }

@@ -23,7 +23,6 @@ mod tests;
 mod tracker;
 mod world_track;
 
-pub use camera_clocks::CameraClock;
 pub use frame::{
     CameraFrame, FixOutcome, FrameOutcome, MovedCamera, TimedEvent, WorldDetection, WorldEvent, WorldTrackId,
 };

@@ -7,7 +7,7 @@ use jiff::Timestamp;
 
 use super::assignment::{Candidate, assign};
 use super::association_cost::PredictedTrack;
-use super::camera_clocks::{CameraClock, CameraClocks};
+use super::camera_clocks::CameraClocks;
 use super::camera_moves::CameraMoves;
 use super::comparisons::{Comparisons, TimedPosition};
 use super::frame::{
@@ -16,6 +16,7 @@ use super::frame::{
 use super::merging::MergeCandidates;
 use super::settings::WorldTrackSettings;
 use super::world_track::{Sighting, WorldTrack, seconds_from};
+use crate::clock_estimate::ClockEstimate;
 use crate::domain::{CameraId, ReceiverId, ReceiverMatch};
 use crate::geo::{EastNorth, LocalPlane, PlaneCovariance};
 
@@ -72,7 +73,7 @@ impl WorldTracker {
 
     /// How late the times of each camera are, where crossings tell.
     #[must_use]
-    pub const fn clocks(&self) -> &BTreeMap<CameraId, CameraClock> {
+    pub const fn clocks(&self) -> &BTreeMap<CameraId, ClockEstimate> {
         self.clocks.clocks()
     }
 

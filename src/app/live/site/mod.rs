@@ -3,6 +3,7 @@
 //! Answers put what they measured into a bounded queue and never wait; one task per site assembles frames, runs
 //! the world tracker and publishes its tracks and events. Everything is in memory: tracks describe the present.
 
+mod clocks;
 mod events;
 mod feed;
 mod item;
@@ -14,18 +15,17 @@ pub(in crate::app) mod state;
 mod task;
 mod tracker;
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::sync::lock;
 use crate::app::App;
 use crate::app::cluster::Nodes;
 use crate::app::site_registry::{ActiveSite, SiteRegistry};
-use crate::domain::{CameraId, Error, ErrorKind, LiveId, Result, SiteId};
-use crate::fusion::world::CameraClock;
+use crate::domain::{Error, ErrorKind, LiveId, Result, SiteId};
 use crate::store::Store;
 use crate::telemetry::Metrics;
 
+pub use clocks::SiteClocks;
 pub use events::{SiteEvent, SiteEventKind};
 pub use published::{WorldSighting, WorldTrackPoint};
 pub use reader::{LossReason, LostSiteEvents, SiteEvents, StoredSiteEvent};
@@ -35,8 +35,8 @@ pub use reader::{LossReason, LostSiteEvents, SiteEvents, StoredSiteEvent};
 pub struct SiteTracks {
     /// The latest point of every track, in the order of the ids.
     pub points: Vec<Arc<WorldTrackPoint>>,
-    /// How late the times of its cameras are, where crossings tell.
-    pub clocks: BTreeMap<CameraId, CameraClock>,
+    /// How late the clocks of its cameras and receivers are.
+    pub clocks: SiteClocks,
     /// The event after which a reader misses nothing that is not among the points.
     pub last_event: LiveId,
 }

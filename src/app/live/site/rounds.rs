@@ -12,7 +12,7 @@ use crate::app::live::identification::MatchingSlot;
 use crate::app::live::matching::{MAX_LOAD, MIN_PERIOD, SEED};
 use crate::clock::Clock;
 use crate::domain::Result;
-use crate::fusion::association::{Cancellation, WorldReceivers};
+use crate::fusion::association::{Cancellation, MatchedReceivers};
 
 /// The rounds of one site.
 pub(super) struct Rounds {
@@ -25,7 +25,7 @@ pub(super) struct Rounds {
 
 struct Finding {
     number_offset: u64,
-    found: Result<WorldReceivers>,
+    found: Result<MatchedReceivers>,
     next_at: Duration,
     _slot: OwnedSemaphorePermit,
 }

@@ -1,18 +1,17 @@
 //! The state in memory of one site, from its creation (or the start of the server) to its deletion.
 
-use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, OnceLock};
 
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
+use super::clocks::SiteClocks;
 use super::events::SiteEvent;
 use super::item::SiteItem;
 use super::published::PublishedTracks;
 use crate::app::live::event_log::EventLog;
 use crate::app::live::sync::lock;
 use crate::domain::{CameraId, HistorySettings, LiveId, ReceiverId, ReceiverMatch, TargetId, TrackScope};
-use crate::fusion::world::CameraClock;
 use crate::geo::Position;
 
 /// Queue, tracks and events of one site.
@@ -26,8 +25,7 @@ pub(in crate::app) struct SiteLive {
     /// The way to the task, which starts with the first item.
     pub(super) queue: OnceLock<mpsc::Sender<SiteItem>>,
     pub(super) tracks: Mutex<PublishedTracks>,
-    /// How late the clocks of its cameras are, where crossings tell.
-    pub(super) clocks: Mutex<BTreeMap<CameraId, CameraClock>>,
+    pub(super) clocks: Mutex<SiteClocks>,
     pub(super) events: Arc<EventLog<SiteEvent>>,
     pub(super) ended: CancellationToken,
 }
@@ -54,25 +52,6 @@ impl SiteLive {
     /// Keeps the tracks of the site that finish from now on; `None` keeps none.
     pub(in crate::app) fn set_history(&self, history: Option<(TrackScope, HistorySettings)>) {
         *lock(&self.history) = history;
-    }
-
-    /// Publishes how late the cameras' times are. Logs which clocks are wrong, or right again, since the last time.
-    pub(super) fn set_clocks(&self, found: BTreeMap<CameraId, CameraClock>) {
-        let mut shown = lock(&self.clocks);
-        for (camera, clock) in &found {
-            let was_wrong = shown.get(camera).is_some_and(CameraClock::is_wrong);
-            let CameraClock { offset_s, sigma_s } = clock;
-            match (was_wrong, clock.is_wrong()) {
-                (false, true) => {
-                    tracing::warn!(%camera, offset_s, sigma_s, "the camera's clock is wrong beside those of the site's other cameras");
-                }
-                (true, false) => {
-                    tracing::info!(%camera, offset_s, sigma_s, "the camera's clock is right again")
-                }
-                _ => {}
-            }
-        }
-        *shown = found;
     }
 
     /// Ends the task and the readers of a site that is deleted, or of a server that ends.

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
+use super::clocks::SiteClocks;
 use super::events::{SiteEvent, SiteEventKind};
 use super::item::{ItemSource, SiteItem};
 use super::places::SitePlaces;
@@ -19,7 +20,7 @@ use crate::app::live::alarms::Finding;
 use crate::app::live::sync::lock;
 use crate::config::Limits;
 use crate::domain::{CameraId, CameraMoved, LiveId, ReceiverId, RunId, TargetClass, TargetId};
-use crate::fusion::association::{LiveMatchSettings, WorldReceiverWindow, WorldReceivers};
+use crate::fusion::association::{LiveMatchSettings, MatchedReceivers, WorldReceiverWindow};
 use crate::fusion::frame_assembler::{AssembledFrame, FrameAssembler, FrameLimits, PushOutcome};
 use crate::fusion::smoother::FilterMoments;
 use crate::fusion::world::{
@@ -163,7 +164,10 @@ impl SiteTracker {
         };
         let time = match (&source, &self.active) {
             (Source::Camera(camera), Some(active)) => active.tracker.corrected(camera, item.time),
-            _ => item.time,
+            (Source::Receiver(target_id), Some(active)) => {
+                active.window.corrected(&ReceiverId::from(target_id.clone()), item.time)
+            }
+            (_, None) => item.time,
         };
         match self.frames.push(&source, is_pacing, time, item, now) {
             PushOutcome::Waiting => {}
@@ -234,11 +238,13 @@ impl SiteTracker {
 
     /// Takes the findings of a round over, unless the tracker has started again since the round began with that offset of
     /// its numbers.
-    pub(super) fn accept(&mut self, number_offset: u64, found: WorldReceivers) {
+    pub(super) fn accept(&mut self, number_offset: u64, found: MatchedReceivers) {
         let Some(active) = self.active.as_mut().filter(|_| self.number_offset == number_offset) else {
             return;
         };
         active.window.accept(found);
+        let wrong = lock(&self.live.clocks).set_receivers(active.window.clocks().clone());
+        self.metrics.clocks_wrong(wrong);
         let events = active.tracker.set_receiver_matches(active.window.receivers());
         self.announce(events);
     }
@@ -267,7 +273,7 @@ impl SiteTracker {
         }
         self.number_offset = self.highest_number;
         // The next tracker knows of no clock.
-        self.live.set_clocks(BTreeMap::new());
+        *lock(&self.live.clocks) = SiteClocks::default();
     }
 
     fn track(&mut self, frame: AssembledFrame<Source, SiteItem>, now: Duration) {
@@ -361,7 +367,8 @@ impl SiteTracker {
         let outcome = active.tracker.observe(&CameraFrame { camera, time, detections });
         self.findings.extend(outcome.moved.as_ref().and_then(|moved| active.finding(moved)));
         if outcome.has_new_clocks {
-            self.live.set_clocks(active.tracker.clocks().clone());
+            let wrong = lock(&self.live.clocks).set_cameras(active.tracker.clocks().clone());
+            self.metrics.clocks_wrong(wrong);
         }
         active.window.observe(&active.tracker, &outcome);
         self.announce(outcome.events);
@@ -379,7 +386,7 @@ impl SiteTracker {
         let position = active.tracker.plane().to_plane(item.position);
         self.metrics.site_item(SiteItemOutcome::Tracked);
         let receiver = ReceiverId::from(target_id.clone());
-        active.window.observe_fix(&receiver, time, position, Some(variance_m2));
+        active.window.observe_fix(&receiver, item.time, position, Some(variance_m2));
         let outcome = active.tracker.observe_fix(&receiver, time, position, variance_m2.sqrt());
         self.announce(outcome.events);
         if let Some(track) = outcome.track {

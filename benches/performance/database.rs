@@ -108,8 +108,8 @@ fn claims(url: &str) {
         &format!(
             "INSERT INTO cameras (id, profile, learn_automatically, revision, created_at_us, updated_at_us) \
              SELECT 'queued-' || n, '{{}}', false, 1, 0, 0 FROM generate_series(1, {QUEUED_RUNS}) AS n; \
-             INSERT INTO training_runs (id, camera_key, recipe, seed, state, created_at_us) \
-             SELECT gen_random_uuid(), key, 'hybrid', 0, 'queued', 0 FROM cameras WHERE id LIKE 'queued-%'; \
+             INSERT INTO training_runs (id, camera_key, recipe, seed, state, priority, created_at_us) \
+             SELECT gen_random_uuid(), key, 'hybrid', 0, 'queued', 0, 0 FROM cameras WHERE id LIKE 'queued-%'; \
              ANALYZE"
         ),
         "",

@@ -48,3 +48,18 @@ test('two cameras of a site, named in their profiles, show one track per target'
   await page.goto(`${server.url}/#/cameras`);
   await expect(page.getByRole('link', { name: 'plaza', exact: true })).toBeVisible();
 });
+
+test('clocks that are wrong are told with what to do', async ({ console: page, server }) => {
+  await server.request('POST', '/v1/sites', { id: 'yard' });
+  let clocks: object = { receiver_clocks: [{ receiver_id: 'phone-7', offset_s: 1.52, sigma_s: 0.1, is_wrong: true }] };
+  await page.route('**/v1/sites/yard/tracks', async (route) => {
+    const response = await route.fetch();
+    await route.fulfill({ response, json: { ...((await response.json()) as object), ...clocks } });
+  });
+  await page.goto(`${server.url}/#/sites/yard`);
+  const alert = page.getByRole('alert');
+  await expect(alert).toContainText('The clock of the receiver phone-7 is ahead by 1.5 s.');
+  // Where most receivers agree, the cameras are wrong, not they.
+  clocks = { ...clocks, common_receiver_clock: { offset_s: 1.5, sigma_s: 0.1, is_wrong: true } };
+  await expect(alert).toHaveText(/^The times of all cameras are 1.5 s earlier than those of the receivers/, { timeout: 20_000 });
+});

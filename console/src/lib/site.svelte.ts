@@ -4,7 +4,7 @@ import { listen } from './events';
 import type { Position, WorldTrack, WorldTrackFeature } from './types';
 
 const TRAIL_POINTS = 240;
-/** How often the cameras' clocks are asked for. */
+/** How often the clocks are asked for. */
 const CLOCKS_MS = 10_000;
 const MOST_CHANGES = 50;
 
@@ -24,9 +24,10 @@ export interface TrackChange {
   ended_track_id?: string;
 }
 
-/** A camera whose clock is wrong beside those of the site's other cameras. */
+/** A camera or a receiver whose clock is wrong beside those of the site's other cameras. */
 export interface WrongClock {
-  camera_id: string;
+  kind: 'camera' | 'receiver';
+  id: string;
   offset_s: number;
 }
 
@@ -34,6 +35,8 @@ export class SiteLive {
   targets = $state.raw<SiteTarget[]>([]);
   changes = $state.raw<TrackChange[]>([]);
   wrongClocks = $state.raw<WrongClock[]>([]);
+  /** By how much the times of all cameras are later than those of most receivers; 0 unless that is no chance. */
+  camerasLate_s = $state(0);
   isOpen = $state(false);
   wasOpen = $state(false);
   readonly #targets = new Map<string, SiteTarget>();
@@ -87,10 +90,19 @@ export class SiteLive {
 
   /** The tracks; the clocks that come with them are shown. */
   async #readNow(path: string): Promise<WorldTrack[]> {
-    type Answer = { items: WorldTrack[]; clocks?: (WrongClock & { is_wrong: boolean })[] };
-    const { items, clocks = [] } = await get<Answer>(`${path}/tracks`).catch((): Answer => ({ items: [] }));
-    this.wrongClocks = clocks.filter(({ is_wrong }) => is_wrong);
-    return items;
+    interface Clock { offset_s: number; is_wrong: boolean }
+    interface Answer { items: WorldTrack[]; clocks?: (Clock & { camera_id: string })[]; receiver_clocks?: (Clock & { receiver_id: string })[]; common_receiver_clock?: Clock }
+    const answer = await get<Answer>(`${path}/tracks`).catch((): Answer => ({ items: [] }));
+    const { clocks = [], receiver_clocks: receivers = [], common_receiver_clock: common } = answer;
+    const wrong = <T extends Clock>(list: T[], kind: WrongClock['kind'], id: (of: T) => string): WrongClock[] =>
+      list.filter(({ is_wrong }) => is_wrong).map((clock) => ({ kind, id: id(clock), offset_s: clock.offset_s }));
+    // Where all receivers are late, the cameras are early.
+    this.camerasLate_s = common?.is_wrong ? -common.offset_s : 0;
+    this.wrongClocks = [
+      ...wrong(clocks, 'camera', ({ camera_id }) => camera_id),
+      ...(this.camerasLate_s ? [] : wrong(receivers, 'receiver', ({ receiver_id }) => receiver_id)),
+    ];
+    return answer.items;
   }
 
   #take(track: WorldTrack): void {

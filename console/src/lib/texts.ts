@@ -582,7 +582,7 @@ const table = {
 
   'profile.changedElsewhere': ['Somebody else has changed the profile. Read it again and repeat your change.', 'Jemand anderes hat das Profil geändert. Neu lesen und die Änderung wiederholen.'],
   'profile.classes': ['Target classes (comma-separated; none means all)', 'Zielklassen (durch Komma getrennt; keine heißt alle)'],
-  'profile.clockOffset': ['Clock ahead by, s', 'Uhr geht vor um, s'],
+  'profile.clockOffset': ['Seconds to add to its times', 'Sekunden, die zu seinen Zeiten kommen'],
   'profile.delete': ['Delete camera', 'Kamera löschen'],
   'profile.delete.text': ['Deletes the camera with its samples, runs and models. This cannot be undone.', 'Löscht die Kamera mit Messpaaren, Läufen und Modellen. Das ist nicht umkehrbar.'],
   'profile.delete.type': ['Type {id} to confirm', 'Zur Bestätigung {id} eingeben'],
@@ -615,6 +615,14 @@ const table = {
     'The times of {camera} are {seconds} s later than those of the other cameras. World tracks correct it. Set the camera’s clock, for example by NTP.',
     'Die Zeiten von {camera} liegen {seconds} s nach denen der anderen Kameras. Die Spuren des Geländes berichtigen das. Die Uhr der Kamera stellen, zum Beispiel mit NTP.',
   ],
+  'site.clocksEarly': [
+    'The times of all cameras are {seconds} s earlier than those of the receivers. World tracks correct it. Set the cameras’ clocks, for example by NTP.',
+    'Die Zeiten aller Kameras liegen {seconds} s vor denen der Empfänger. Die Spuren des Geländes berichtigen das. Die Uhren der Kameras stellen, zum Beispiel mit NTP.',
+  ],
+  'site.clocksLate': [
+    'The times of all cameras are {seconds} s later than those of the receivers. World tracks correct it. Set the cameras’ clocks, for example by NTP.',
+    'Die Zeiten aller Kameras liegen {seconds} s nach denen der Empfänger. Die Spuren des Geländes berichtigen das. Die Uhren der Kameras stellen, zum Beispiel mit NTP.',
+  ],
   'site.field': ['Site: cameras of one site track their targets together', 'Gelände: Kameras eines Geländes verfolgen ihre Ziele gemeinsam'],
   'site.field.none': ['none', 'keines'],
   'site.handedOver': ['{track} went from {from} to {to}', '{track} ging von {from} zu {to}'],
@@ -624,6 +632,10 @@ const table = {
   'site.merged': ['{track} and {ended} are the same target', '{track} und {ended} sind dasselbe Ziel'],
   'site.none': ['No target is tracked on this site now.', 'Auf diesem Gelände wird zurzeit kein Ziel verfolgt.'],
   'site.of': ['Site {site}', 'Gelände {site}'],
+  'site.receiverClock': [
+    'The clock of the receiver {receiver} is ahead by {seconds} s. World tracks correct it. Subtract it from the receiver’s offset in the profile of its camera.',
+    'Die Uhr des Empfängers {receiver} geht um {seconds} s vor. Die Spuren des Geländes berichtigen das. Den Versatz des Empfängers im Profil seiner Kamera um so viel verringern.',
+  ],
   'site.seenBy': ['Seen by', 'Gesehen von'],
   'site.tabs': ['Views of the site', 'Ansichten des Geländes'],
   'site.title': ['Sites', 'Gelände'],

@@ -1,1 +1,0 @@
-import{F as e}from"./app-DvmXEFGO.js";var t=`recipe.`,n=Object.keys(e.en).filter(e=>e.startsWith(t)).map(e=>e.slice(7));export{n as t};

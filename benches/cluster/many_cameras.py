@@ -68,7 +68,7 @@ def stored_in(place: str) -> dict[str, str]:
 
 def is_filled(place: str) -> bool:
     if is_folder(place):
-        return Path(place).exists()
+        return (Path(place) / "sightfix.db").exists()
     return sql(place, "SELECT to_regclass('cameras') IS NULL") == "f"
 
 

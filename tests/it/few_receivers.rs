@@ -347,6 +347,7 @@ fn shared_known_points_by_number_of_receivers() {
 fn shared_phones_beside_the_homography() {
     let draws = std::env::var("DRAWS").map_or(1, |draws| draws.parse().expect("a number"));
     println!("| camera | phones | homography | mean | ratio | inside |\n|---|---:|---|---|---:|---|");
+    let mut all = Vec::new();
     for camera in ["c1", "c2", "c3"] {
         let recordings: Vec<Recording> =
             (1..=draws).map(|draw| Recording::plaza(camera, Some(draw))).collect();
@@ -357,16 +358,23 @@ fn shared_phones_beside_the_homography() {
                 [own.mean_m, recording.score_of_homography(phones, draw).mean_m, own.coverage]
             });
             let scores: Vec<[f64; 3]> = scores.collect();
-            let mean = |at: usize| scores.iter().map(|own| own[at]).sum::<f64>() / scores.len() as f64;
             let with_range = |at: usize| {
                 let least = scores.iter().map(|own| own[at]).fold(f64::INFINITY, f64::min);
                 let most = scores.iter().map(|own| own[at]).fold(0.0, f64::max);
-                format!("{:.2} ({least:.2} to {most:.2})", mean(at))
+                format!("{:.2} ({least:.2} to {most:.2})", mean(&scores, at))
             };
             let [own, of_homography, inside] = [0, 1, 2].map(with_range);
-            let ratio = mean(0) / mean(1);
+            let ratio = mean(&scores, 0) / mean(&scores, 1);
             println!("| {camera} | {phones} | {of_homography} | {own} | {ratio:.2} | {inside} |");
-            assert!(ratio < 1.0 && mean(2) > 0.7, "{camera}, {phones}");
+            all.extend(scores);
         }
     }
+    // Over all rows: one draw of one camera may favour a homography.
+    let (ratio, inside) = (mean(&all, 0) / mean(&all, 1), mean(&all, 2));
+    assert!(ratio < 0.8 && inside > 0.9, "{ratio} of the homography, {inside} inside");
+}
+
+/// Mean of a figure over scores.
+fn mean(scores: &[[f64; 3]], at: usize) -> f64 {
+    scores.iter().map(|own| own[at]).sum::<f64>() / scores.len() as f64
 }

@@ -1,5 +1,7 @@
 //! How late a clock is by an estimate, and from where on that is no chance.
 
+use jiff::{SignedDuration, Timestamp};
+
 /// An offset is wrong, and corrected, beyond this one, s, and that many standard deviations.
 const LEAST_WRONG_S: f64 = 0.2;
 const SIGNIFICANT: f64 = 4.0;
@@ -19,4 +21,10 @@ impl ClockEstimate {
     pub fn is_wrong(&self) -> bool {
         self.offset_s.abs() > LEAST_WRONG_S.max(SIGNIFICANT * self.sigma_s)
     }
+}
+
+/// A time less what it is late by, s; the time itself where no such time exists.
+pub(crate) fn earlier(time: Timestamp, late_s: f64) -> Timestamp {
+    let late = SignedDuration::try_from_secs_f64(late_s).unwrap_or_default();
+    time.checked_sub(late).unwrap_or(time)
 }

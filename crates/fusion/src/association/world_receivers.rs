@@ -16,9 +16,10 @@ use super::chains::ChainSettings;
 use super::companions::missed_companion_factor;
 use super::evidence::EvidenceModel;
 use super::live::LiveMatchSettings;
-use super::matching::{LEAST_WHITE_SIGMA_M, piece_posterior};
+use super::matching::{LEAST_WHITE_SIGMA_M, OwnedPiece, piece_posterior};
 use super::receiver_clocks::{CarriedFixes, ReceiverClocks};
 use super::tracklet::{SceneMotion, TimedFix, TrackPoint, Tracklet};
+use crate::clock_estimate::earlier;
 use crate::domain::{GaussMarkovNoise, ReceiverId, ReceiverMatch, Result};
 use crate::geo::EastNorth;
 use crate::world::{FrameOutcome, WorldEvent, WorldTrack, WorldTrackId, WorldTracker};
@@ -137,8 +138,7 @@ impl WorldReceiverWindow {
     /// A receiver's time by the cameras' clock.
     #[must_use]
     pub fn corrected(&self, receiver: &ReceiverId, time: Timestamp) -> Timestamp {
-        let late = SignedDuration::try_from_secs_f64(self.clocks.corrected_s(receiver)).unwrap_or_default();
-        time.checked_sub(late).unwrap_or(time)
+        earlier(time, self.clocks.corrected_s(receiver))
     }
 
     /// The most probable receiver of each track as it is now, and the receivers' clocks.
@@ -157,18 +157,18 @@ impl WorldReceiverWindow {
         let (tracks, receivers): (Vec<_>, Vec<_>) =
             (self.tracks.keys().collect(), self.fixes.keys().collect());
         // What was found before a cut is no evidence about the target after it.
-        let current =
-            posterior.owned().filter(|own| own.piece.end == tracklets[own.piece.tracklet].points.len());
+        let owned: Vec<OwnedPiece> = posterior.owned().collect();
+        let current = owned.iter().filter(|own| own.piece.end == tracklets[own.piece.tracklet].points.len());
         let matched = current.map(|own| {
             let receiver_id = receivers[own.receiver].clone();
             let probability = own.probability * missed_companion_factor();
             (*tracks[own.piece.tracklet], ReceiverMatch { receiver_id, probability })
         });
         let clock = |(receiver, own): (&ReceiverId, usize)| {
-            let pieces = posterior
-                .owned()
+            let sure = owned
+                .iter()
                 .filter(|piece| piece.receiver == own && piece.probability >= self.settings.matched_from);
-            let pieces: Vec<&[TrackPoint]> = pieces
+            let pieces: Vec<&[TrackPoint]> = sure
                 .map(|own| &tracklets[own.piece.tracklet].points[own.piece.first..own.piece.end])
                 .collect();
             let carried = CarriedFixes { pieces: &pieces, fixes: &fixes[own] };

@@ -14,12 +14,12 @@
 
 use std::collections::BTreeMap;
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 use nalgebra::{DMatrix, DVector};
 
 use super::comparisons::{CameraPair, Comparisons, Overlap};
 use super::map_difference::Effects;
-use crate::clock_estimate::ClockEstimate;
+use crate::clock_estimate::{ClockEstimate, earlier};
 use crate::domain::CameraId;
 
 /// Estimates of the clocks of a site's cameras.
@@ -34,8 +34,7 @@ impl CameraClocks {
 
     /// A camera's time by the clock of most cameras.
     pub(super) fn corrected(&self, camera: &CameraId, time: Timestamp) -> Timestamp {
-        let late = SignedDuration::try_from_secs_f64(self.corrected_s(camera)).unwrap_or_default();
-        time.checked_sub(late).unwrap_or(time)
+        earlier(time, self.corrected_s(camera))
     }
 
     /// What is taken off a camera's times, s.

@@ -43,6 +43,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--check", type=Path, metavar="FOLDER", help="only check the history of a folder again")
     parser.add_argument("--planted", action="store_true", help="no faults: break promises on purpose, and find that")
     parser.add_argument("--soak", type=float, metavar="SECONDS", help="no faults: measure what the servers hold")
+    parser.add_argument("--pause-factor", type=float, default=1.0, help="clients pause so many times as long")
     return parser.parse_args()
 
 
@@ -109,7 +110,7 @@ def main() -> int:
         most = DataFolder.most_nodes if given.backend == "folder" else PostgreSQL.most_nodes
         options = Options(
             given.seed, given.faults, given.backend, min(given.nodes, most), given.replication, given.kinds, SETTLE_S,
-            str(given.next.resolve()) if given.next else None,
+            str(given.next.resolve()) if given.next else None, given.pause_factor,
         )  # fmt: skip
         new = ROOT / "target" / "histories" / f"{given.backend}-{given.seed}-{int(time.time())}"
         folder = (given.out or new).resolve()

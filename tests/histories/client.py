@@ -39,6 +39,8 @@ class Setting:
     epochs: int
     #: Where webhooks are received.
     hook_port: int
+    #: All pauses are so many times as long.
+    pause_factor: float
 
 
 class Client:
@@ -54,7 +56,7 @@ class Client:
     def steps(self, pause_s: float) -> Iterator[int]:
         """Counts from 1, with pauses of about `pause_s` seconds, until the client is to end."""
         for step in itertools.count(1):
-            if self._ending.wait(self.chance.uniform(0.5, 1.5) * pause_s):
+            if self._ending.wait(self.chance.uniform(0.5, 1.5) * pause_s * self.setting.pause_factor):
                 return
             yield step
 

@@ -53,6 +53,8 @@ class Options:
     settle_s: float
     #: The program from the first rolling restart on, where it is another one.
     next: str | None = None
+    #: Pauses of the clients are so many times as long.
+    pause_factor: float = 1.0
 
 
 def binary() -> Path:
@@ -258,7 +260,10 @@ def clients_at_work(options: Options, cluster: Cluster, ways: Ways, folder: Path
     api = Api(cluster.url, cluster.admin_key, Recorder(history / "setup.ndjson", "setup"), timeout_s=30)
     prepare(api, MODEL.read_bytes(), training_rows(binary(), folder), ways.hook_port)
     clients = Clients(
-        [Setting(name, ways, cluster.admin_key, options.seed, history, EPOCHS, hook_port) for name in names()]
+        [
+            Setting(name, ways, cluster.admin_key, options.seed, history, EPOCHS, hook_port, options.pause_factor)
+            for name in names()
+        ]
     )
     try:
         yield clients

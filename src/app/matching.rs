@@ -13,7 +13,7 @@ use crate::domain::{
     Association, ClockOffset, Error, ErrorKind, ImageSize, ReceiverId, Receivers, Result, TargetId, TrackerId,
 };
 use crate::fusion::association::{
-    Cancellation, MatchLimits, MatchSettings, MatchedGroup, MatchedPiece, Matching, WorldScores,
+    Cancellation, CarrierBox, MatchLimits, MatchSettings, MatchedGroup, MatchedPiece, Matching, WorldScores,
     match_with_model, match_without_model,
 };
 use crate::model::Regressor;
@@ -46,7 +46,7 @@ pub struct MatchRequest<'a> {
 /// A recording whose sure boxes have the ids of their receivers.
 #[derive(Debug, Clone)]
 pub struct MatchedRecording {
-    /// Boxes that are not sure keep their tracker's id.
+    /// Boxes that are not sure keep their tracker's id. The mean boxes of groups are among the detections.
     pub recording: Recording,
     /// The receivers under their own ids, with the clock offsets that were found.
     pub receivers: Receivers,
@@ -108,6 +108,8 @@ pub struct SharedReceiver {
     pub from: Timestamp,
     /// Last instant at which all members are seen.
     pub to: Timestamp,
+    /// Number of mean boxes of the members, of which samples are made.
+    pub detections: u64,
     /// Posterior probability that one of the members is the carrier.
     pub probability: f64,
     /// The members, the most probable first.
@@ -165,26 +167,27 @@ impl Recording {
                 return Err(Error::invalid("image_size", message));
             }
         };
-        let report = self.report(&matching, settings.min_probability, world);
-        if report.pairs.is_empty() {
+        let report = self.report(&matching, world);
+        if report.pairs.is_empty() && report.groups.is_empty() {
             return Err(Error::refused(
                 ErrorKind::NotIdentifiable,
                 format!(
-                    "no tracklet has a receiver of probability {} or more; record longer, with receivers \
-                     carried across the whole view while few others are there",
-                    settings.min_probability
+                    "no tracklet, and no group of them, has a receiver of probability {} or more; record longer, with \
+                     receivers carried across the whole view while few others are there",
+                    report.min_probability
                 ),
             ));
         }
         let receivers = matching.receivers_of(&self.fixes, receivers);
-        let associations = self.rename(&matching, settings.min_probability)?;
+        let associations = self.rename(&matching)?;
         Ok(MatchedRecording { recording: self, receivers, associations, report })
     }
 
-    fn report(&self, matching: &Matching, min_probability: f64, world: Option<WorldScores>) -> MatchReport {
+    fn report(&self, matching: &Matching, world: Option<WorldScores>) -> MatchReport {
+        let min_probability = matching.min_probability;
         let time = |at: Option<&usize>| at.map_or(Timestamp::UNIX_EPOCH, |at| self.detections[*at].time);
         let mut pairs: Vec<MatchedPair> = matching
-            .sure(min_probability)
+            .sure()
             .map(|piece| MatchedPair {
                 receiver_id: piece.receiver_id.clone(),
                 tracker_id: piece.tracker_id.clone(),
@@ -206,6 +209,7 @@ impl Recording {
                 receiver_id: group.receiver_id().clone(),
                 from: *times.first()?,
                 to: *times.last()?,
+                detections: group.boxes(&self.detections).count() as u64,
                 probability: group.probability(),
                 members: group.members.iter().map(member).collect(),
             })
@@ -228,27 +232,21 @@ impl Recording {
         }
     }
 
-    /// Sure boxes get their receiver's id. A tracker's id that is also a receiver's is changed: its boxes
-    /// must not be paired by name.
-    fn rename(&mut self, matching: &Matching, min_probability: f64) -> Result<Associations> {
-        let mut associations = Associations::new();
-        let mut is_sure = vec![false; self.detections.len()];
-        for piece in matching.sure(min_probability) {
-            let target_id = TargetId::from(piece.receiver_id.clone());
-            for at in &piece.detections {
-                is_sure[*at] = true;
-                let own = &mut self.detections[*at];
-                own.target_id = target_id.clone();
-                let association =
-                    Association { tracker_id: piece.tracker_id.clone(), probability: piece.probability };
-                associations.insert((own.time, target_id.clone()), association);
-            }
-        }
+    /// The boxes of carriers get their receivers' ids; those of groups come beside those of their members. A tracker's id that is also
+    /// a receiver's is changed: its boxes must not be paired by name.
+    fn rename(&mut self, matching: &Matching) -> Result<Associations> {
+        let carriers = matching.carrier_boxes(&self.detections);
         let receivers: BTreeSet<TargetId> =
             self.fixes.iter().filter_map(|fix| fix.receiver_id.clone()).map(TargetId::from).collect();
-        for (own, is_sure) in self.detections.iter_mut().zip(is_sure) {
-            if !is_sure && receivers.contains(&own.target_id) {
-                own.target_id = TargetId::from(&TrackerId::new(own.target_id.as_str())?);
+        for own in self.detections.iter_mut().filter(|own| receivers.contains(&own.target_id)) {
+            own.target_id = TargetId::from(&TrackerId::new(own.target_id.as_str())?);
+        }
+        let mut associations = Associations::new();
+        for CarrierBox { detection, association, at } in carriers {
+            associations.insert((detection.time, detection.target_id.clone()), association);
+            match at {
+                Some(at) => self.detections[at] = detection,
+                None => self.detections.push(detection),
             }
         }
         Ok(associations)

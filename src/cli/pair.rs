@@ -123,9 +123,9 @@ struct MatchFlags {
     /// Size of the image, to match without a model, for --box-unit share, and for boxes of yolo
     #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = image_size)]
     image_size: Option<ImageSize>,
-    /// Leave out samples whose match is less probable than this
-    #[arg(long, value_name = "P", requires = "matches", default_value_t = 0.9)]
-    min_probability: f64,
+    /// Leave out samples whose match is less probable than this [default: 0.9 by a model, 0.8 without one]
+    #[arg(long, value_name = "P", requires = "matches")]
+    min_probability: Option<f64>,
     /// The receivers' clocks are off by at most this, s
     #[arg(long, value_name = "S", requires = "matches", default_value_t = 0.0)]
     clock_window_s: f64,
@@ -413,11 +413,12 @@ fn print_match(summary: &Summary, report: &MatchReport) -> anyhow::Result<()> {
     for group in &report.groups {
         let members: Vec<&str> = group.members.iter().map(|own| own.tracker_id.as_str()).collect();
         summary.line(&format_args!(
-            "one of {} is {} from {} to {}, probability {:.3}",
+            "one of {} is {} from {} to {}, {} mean boxes, probability {:.3}",
             members.join(", "),
             group.receiver_id,
             group.from,
             group.to,
+            group.detections,
             group.probability
         ))?;
     }
@@ -442,6 +443,7 @@ fn match_document(report: &MatchReport) -> serde_json::Value {
             "receiver_id": group.receiver_id.as_str(),
             "from": group.from,
             "to": group.to,
+            "detections": group.detections,
             "probability": group.probability,
             "members": group.members.iter().map(member).collect::<Vec<_>>(),
         })

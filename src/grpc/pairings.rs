@@ -167,7 +167,7 @@ fn layout(layout: proto::CsvLayout) -> Result<CsvLayout> {
 fn matching(options: proto::MatchOptions, limits: &Limits) -> Result<MatchSettings> {
     let default = MatchSettings::default();
     let settings = MatchSettings::new(
-        options.min_probability.unwrap_or(default.min_probability),
+        options.min_probability,
         options.clock_window_s.unwrap_or(default.clock_window_s),
         limits.into(),
     );
@@ -256,6 +256,7 @@ impl From<MatchReport> for proto::MatchReport {
             to: Some(timestamp(group.to)),
             probability: group.probability,
             members: group.members.into_iter().map(member).collect(),
+            detections: group.detections,
         });
         Self {
             tracklets: report.tracklets as u64,

@@ -99,8 +99,8 @@ struct Matching {
     unsure_detections: u64,
     /// Pairs of tracklet and receiver with at least that probability.
     pairs: Vec<MatchedPair>,
-    /// Groups of tracklets: one of them shows the carrier with at least that probability, none of them alone does. No
-    /// samples are made of their boxes.
+    /// Groups of tracklets: one of them shows the carrier with at least that probability, none of them alone does. Samples are made
+    /// of the means of their boxes, weighed by their probabilities.
     groups: Vec<MatchedGroup>,
 }
 
@@ -134,6 +134,8 @@ struct MatchedGroup {
     /// Last instant at which all members are seen.
     #[schema(value_type = String, format = DateTime)]
     to: jiff::Timestamp,
+    /// Number of mean boxes.
+    detections: u64,
     /// Posterior probability that one of the members carries it, 0 to 1.
     probability: f64,
     /// The members, the most probable first.
@@ -255,7 +257,7 @@ struct ClockOffsetEstimate {
         ("receiver_id" = Option<String>, Query, description = "The receiver of fixes that name none"),
         ("keep_unpaired" = Option<bool>, Query, description = "Store the boxes that find no fix as samples without one"),
         ("match" = Option<bool>, Query, description = "Find out whose boxes show whose receivers"),
-        ("min_probability" = Option<f64>, Query, description = "With `match`, leave out samples whose match is less probable, 0.9 if left out; 0.5 to 1"),
+        ("min_probability" = Option<f64>, Query, description = "With `match`, leave out samples whose match is less probable, 0.5 to 1; if left out 0.9, for a camera without a model 0.8"),
         ("clock_window_s" = Option<f64>, Query, description = "With `match`, the receivers' clocks are off by at most this, 0 if left out; 0 to 30"),
         ("durability" = inline(Option<Durability>), Query, description = "When the samples are acknowledged: `synced` (if left out), after they have been flushed to the disk; `relaxed`, after their commit, which a power cut may undo"),
         ("on_conflict" = inline(Option<OnConflict>), Query, description = "The rule for a sample that is stored already: `keep` (if left out) counts the new one as a duplicate, `replace` stores the new one instead"),
@@ -340,7 +342,7 @@ fn matching(params: &mut Params, app: &App) -> Result<Option<MatchSettings>> {
     }
     let default = MatchSettings::default();
     let settings = MatchSettings::new(
-        min_probability.unwrap_or(default.min_probability),
+        min_probability,
         clock_window_s.unwrap_or(default.clock_window_s),
         (&app.limits).into(),
     )?;
@@ -409,6 +411,7 @@ impl From<MatchReport> for Matching {
             receiver_id: own.receiver_id.as_str().to_owned(),
             from: own.from,
             to: own.to,
+            detections: own.detections,
             probability: own.probability,
             members: own.members.into_iter().map(member).collect(),
         };

@@ -1,6 +1,6 @@
 //! Boxes with only a tracker's ids against a running server: matched live, and in an import.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::time::Duration;
 
@@ -368,7 +368,8 @@ async fn a_receiver_within_a_group_is_given_to_the_group() {
     const PATH: &str = "/v1/cameras/yard/samples/pairings?match=true";
     let folder = data_folder();
     let server = trained_yard(folder.path()).await;
-    let (content_type, body) = multipart(&with_companion(&LIVE.recorded(), 0));
+    let recorded = with_companion(&LIVE.recorded(), 0);
+    let (content_type, body) = multipart(&recorded);
     let kind = [("content-type", content_type.as_str())];
     let report = server.send("POST", PATH, &kind, body).await.expect(200).json();
     let matching = &report["matching"];
@@ -377,7 +378,7 @@ async fn a_receiver_within_a_group_is_given_to_the_group() {
     assert!(!pairs.is_empty() && pairs.iter().all(|pair| text(pair, "receiver_id") == "phone-1"), "{report}");
     let groups = matching["groups"].as_array().expect("groups");
     let shared: Vec<&Value> = groups.iter().filter(|own| text(own, "receiver_id") == "phone-0").collect();
-    assert!(!shared.is_empty(), "{report}");
+    let mut mean_boxes = 0;
     for group in shared {
         let members = group["members"].as_array().expect("members");
         let ids: Vec<String> = members.iter().map(|own| text(own, "tracker_id")).collect();
@@ -387,7 +388,22 @@ async fn a_receiver_within_a_group_is_given_to_the_group() {
         let sum: f64 = members.iter().map(share).sum();
         assert!(sum >= 0.9 && members.iter().all(|own| share(own) < 0.9), "{group}");
         assert!((share(group) - sum).abs() < 1e-9, "{group}");
+        mean_boxes += group["detections"].as_u64().expect("a number");
     }
+    // Samples are of the means of the members' boxes, which no detector saw.
+    let seen: BTreeSet<&str> =
+        recorded.detections.lines().filter_map(|line| line.split(',').nth(2)).collect();
+    let exported = exported_csv(&server).await;
+    let cells = |line: &str| line.split(',').map(str::to_owned).collect::<Vec<String>>();
+    let columns = ["target_id", "left"].map(|name| {
+        exported.lines().next().and_then(|header| cells(header).iter().position(|own| own == name))
+    });
+    let [Some(target), Some(left)] = columns else { panic!("{exported}") };
+    let of_group =
+        |line: &&str| cells(line)[target] == "phone-0" && !seen.contains(cells(line)[left].as_str());
+    let stored = exported.lines().filter(of_group).count();
+    // One for each fix.
+    assert!(stored > 150 && stored as u64 <= mean_boxes, "{stored} of {mean_boxes}: {report}");
 }
 
 #[tokio::test]

@@ -27,7 +27,7 @@ pub struct JointFigures {
     pub beyond_twice: usize,
     /// Recordings that were accepted with the fixes shifted in time, so that no identity is true.
     pub shifted_accepted: usize,
-    /// Sum of the mean errors of the accepted models, m.
+    /// Sum of the mean errors of the models that are trained on the samples of the accepted matches, m.
     pub error_sum_m: f64,
     /// The same of the models with identities in these cases, m.
     pub known_error_sum_m: f64,

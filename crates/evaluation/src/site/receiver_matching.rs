@@ -14,7 +14,8 @@ use crate::domain::{
     Detection, Error, Fix, GnssError, ReceivedFix, Receivers, Recipe, Result, Sample, TargetId,
 };
 use crate::fusion::association::{
-    Cancellation, MatchSettings, WorldScores, match_with_model, match_without_model,
+    Cancellation, CarrierBox, MatchSettings, WorldScores, joint_pairing, match_with_model,
+    match_without_model,
 };
 use crate::fusion::pairing::{PairingRule, PairingSettings, pair};
 use crate::model::{FitError, FitInput, FitOptions, Regressor, fit};
@@ -27,7 +28,7 @@ const STRIDE: usize = 4;
 pub struct JointFound {
     /// The pairs.
     pub figures: PairFigures,
-    /// Mean error of the model that was trained on them, over all boxes, m.
+    /// Mean error, over all boxes, of the model that is trained on the samples which such a match gives, m.
     pub mean_error_m: f64,
     /// Scores of the place and direction.
     pub scores: WorldScores,
@@ -73,8 +74,8 @@ impl SiteRecording {
         shifted
     }
 
-    /// The boxes of a camera's carriers, by name, with their fixes, and the boxes of all others.
-    fn known_samples(&self, camera: usize) -> (Vec<Sample>, Vec<Detection>) {
+    /// The boxes of a camera's carriers under their receivers' ids, and the boxes of all others.
+    fn known_boxes(&self, camera: usize) -> (Vec<Detection>, Vec<Detection>) {
         let carried: BTreeMap<usize, TargetId> =
             self.receivers.iter().map(|(id, target)| (*target, TargetId::from(id.clone()))).collect();
         let (mut own, mut others) = (Vec::new(), Vec::new());
@@ -84,8 +85,7 @@ impl SiteRecording {
                 None => others.push(detection),
             }
         }
-        let settings = PairingSettings { rule: PairingRule::Interpolated, ..PairingSettings::default() };
-        (pair(own, self.received_fixes(), &Receivers::default(), &settings).samples, others)
+        (own, others)
     }
 
     /// The model of a camera that is trained with the identities.
@@ -93,7 +93,18 @@ impl SiteRecording {
     /// # Errors
     /// Those of [`fit`].
     pub fn known_model(&self, camera: usize, recipe: Recipe) -> std::result::Result<Regressor, FitError> {
-        let (samples, others) = self.known_samples(camera);
+        let (own, others) = self.known_boxes(camera);
+        let pairing = PairingSettings { rule: PairingRule::Interpolated, ..PairingSettings::default() };
+        let samples = pair(own, self.received_fixes(), &Receivers::default(), &pairing).samples;
+        self.trained(&samples, &others, recipe)
+    }
+
+    fn trained(
+        &self,
+        samples: &[Sample],
+        others: &[Detection],
+        recipe: Recipe,
+    ) -> std::result::Result<Regressor, FitError> {
         let options = FitOptions {
             recipe,
             seed: 1,
@@ -102,7 +113,7 @@ impl SiteRecording {
             gnss_error: GnssError::Unknown,
             gnss_bias_sigma_m: None,
         };
-        let input = FitInput { samples: &samples, unpaired: &others, known_points: &[] };
+        let input = FitInput { samples, unpaired: others, known_points: &[] };
         fit(input, &options, &mut |_| ControlFlow::Continue(()))?.load().map_err(FitError::Unusable)
     }
 
@@ -141,22 +152,34 @@ impl SiteRecording {
     /// Matches a camera's boxes with the receivers where nothing is known.
     ///
     /// # Errors
-    /// `NotIdentifiable` with the reason, and the others of [`match_without_model`].
-    pub fn matched_jointly(&self, camera: usize, seed: u64) -> Result<JointFound> {
-        let image_size =
-            self.image_size.ok_or_else(|| Error::invalid("image_size", "is needed to find a camera"))?;
+    /// `NotIdentifiable` with the reason, and the others of [`match_without_model`] and [`fit`].
+    pub fn matched_jointly(&self, camera: usize, seed: u64) -> std::result::Result<JointFound, FitError> {
+        let image_size = self
+            .image_size
+            .ok_or_else(|| FitError::Unusable(Error::invalid("image_size", "is needed to find a camera")))?;
+        let (mut detections, fixes) = (self.detections(camera), self.received_fixes());
         let found = match_without_model(
-            &self.detections(camera),
-            &self.received_fixes(),
+            &detections,
+            &fixes,
             &Receivers::default(),
             image_size,
             &MatchSettings::default(),
             &mut ChaCha8Rng::seed_from_u64(seed),
             Cancellation::NEVER,
-        )?;
+        )
+        .map_err(FitError::Unusable)?;
+        for CarrierBox { detection, at, .. } in found.matching.carrier_boxes(&detections) {
+            match at {
+                Some(at) => detections[at] = detection,
+                None => detections.push(detection),
+            }
+        }
+        let receivers = found.matching.receivers_of(&fixes, &Receivers::default());
+        let paired = pair(detections, fixes, &receivers, &joint_pairing());
+        let model = self.trained(&paired.samples, &paired.unpaired_detections, Recipe::GaussianProcess)?;
         Ok(JointFound {
             figures: PairFigures::of(self, camera, &found.matching),
-            mean_error_m: self.mean_error_m(camera, &found.model.load()?),
+            mean_error_m: self.mean_error_m(camera, &model),
             scores: found.scores,
         })
     }

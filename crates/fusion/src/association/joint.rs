@@ -1,7 +1,7 @@
 //! Boxes matched with receivers where the camera has no model: both are found together.
 //!
 //! Boxes alone give the ground plane up to place and direction ([`GroundCamera`], one per focal length).
-//! [`PlacementSearch`] finds these by the fixes of all receivers, without knowing their carriers. Sure pieces then
+//! [`PlacementSearch`] finds these by the fixes of all receivers, without knowing their carriers. Probable pieces and groups then
 //! train a model in the normal way, which matches again, until both stay. A world is accepted only on
 //! evidence that identities which are certainly wrong cannot have.
 
@@ -12,19 +12,20 @@ use jiff::SignedDuration;
 use rand::Rng;
 
 use super::cancellation::Cancellation;
+use super::carriers::{CarrierBox, Matching};
 use super::evidence::EvidenceModel;
 use super::matching::{
-    Located, MatchSettings, Matching, check_size, clock_grid, match_located, match_scene, receiver_noise,
+    Located, MatchSettings, check_size, clock_grid, match_located, match_scene, receiver_noise,
 };
 use super::placement::{Density, GroundPrior, Placement, PlacementSearch};
 use super::recording::Scene;
 use super::tracklet::{SceneMotion, TimedFix, TrackPoint, Tracklet};
 use crate::domain::{
-    BoundingBox, Detection, Error, ErrorKind, GnssError, ImageSize, ReceivedFix, ReceiverId, Receivers,
-    Recipe, Result, Sample, TargetClass, TargetId,
+    BoundingBox, Detection, Error, ErrorKind, GnssError, ImageSize, ReceivedFix, Receivers, Recipe, Result,
+    Sample, TargetClass, TargetId,
 };
 use crate::geo::{EastNorth, LocalPlane};
-use crate::model::{Artifact, FitEvent, FitInput, FitOptions, GroundCamera, Regressor, fit};
+use crate::model::{FitEvent, FitInput, FitOptions, GroundCamera, Regressor, fit};
 use crate::pairing::{PairingRule, PairingSettings, pair};
 
 /// Shifts of the receivers' clocks as shares of the recording, for identities that are certainly wrong.
@@ -41,6 +42,8 @@ const MIN_MODE_MARGIN: f64 = 3.0;
 const SAME_WORLD: f64 = 6.0;
 /// Sure pieces at least: one or two straight walks fit more than one place and direction.
 const MIN_PIECES: usize = 3;
+/// So many groups count for one of them: at another place of the camera, too, a receiver is mostly near one of several.
+const GROUPS_FOR_A_PIECE: usize = 10;
 /// The trained model departs from the placement by at most this number of standard deviations of the latter in the
 /// mean.
 const MAX_DEPARTURE: f64 = 5.0;
@@ -54,8 +57,10 @@ const GROUND_OF_UNKNOWN_HEIGHT: GroundPrior =
 const ROUNDS: usize = 4;
 /// Rounds end when the model moves positions by less than this in the mean, in the standard deviation of the ground.
 const STABLE: f64 = 0.1;
-/// Posterior probability from which on boxes train the model. Where two neighbours are alike, either of them serves: they
-/// are closer to each other than fixes are to their carriers.
+/// Posterior probability from which on pieces are sure where nothing else is asked for: with fewer receivers the model of the samples
+/// is worse than the less sure ones make it, for those are mostly of a neighbour.
+const MIN_PROBABILITY: f64 = 0.8;
+/// Posterior probability from which on tracklets, and groups of them, train the model that matches.
 const TRAINING_PROBABILITY: f64 = 0.5;
 /// Receivers from which on each half of them trains a model of its own.
 const MIN_HALVED_RECEIVERS: usize = 4;
@@ -65,13 +70,11 @@ const MAX_HALVES_DISTANCE: f64 = 3.0;
 /// Placements kept per ground camera.
 const MODES: usize = 12;
 
-/// The match, and the model that was trained on it.
+/// The match, and the evidence for the camera's place.
 #[derive(Debug, Clone)]
 pub struct JointMatch {
     /// Which boxes show which receivers' carriers.
     pub matching: Matching,
-    /// The model of the last round.
-    pub model: Artifact,
     /// Score of the world, of the best one with shifted clocks, and of the second best.
     pub scores: WorldScores,
 }
@@ -117,7 +120,7 @@ pub fn match_without_model(
 
 struct JointSearch<'a> {
     scene: &'a Scene<'a>,
-    settings: &'a MatchSettings,
+    settings: MatchSettings,
     image_size: ImageSize,
     model: EvidenceModel,
     ground: GroundPrior,
@@ -127,7 +130,7 @@ struct JointSearch<'a> {
 }
 
 impl<'a> JointSearch<'a> {
-    fn new(scene: &'a Scene<'a>, image_size: ImageSize, settings: &'a MatchSettings) -> Result<Self> {
+    fn new(scene: &'a Scene<'a>, image_size: ImageSize, settings: &MatchSettings) -> Result<Self> {
         let Some(plane) = scene.plane() else {
             return Err(not_identifiable("no fix names a receiver", "name the receiver of every fix"));
         };
@@ -154,7 +157,10 @@ impl<'a> JointSearch<'a> {
         };
         Ok(Self {
             scene,
-            settings,
+            settings: MatchSettings {
+                min_probability: settings.min_probability.or(Some(MIN_PROBABILITY)),
+                ..*settings
+            },
             image_size,
             model: EvidenceModel { gnss, motion },
             ground,
@@ -190,7 +196,7 @@ impl<'a> JointSearch<'a> {
         PlacementSearch::new(
             &tracklets,
             fixes,
-            &clock_grid(self.settings),
+            &clock_grid(&self.settings),
             &self.model,
             &self.ground,
             log_prior,
@@ -280,32 +286,31 @@ impl<'a> JointSearch<'a> {
         self.fixes.iter().map(shifted).collect()
     }
 
-    fn matched(&self, world: &World, random: &mut impl Rng) -> Result<Matching> {
+    fn matched(&self, world: &World, settings: &MatchSettings, random: &mut impl Rng) -> Result<Matching> {
         let (tracklets, points) = self.scene.located(|bounding_box| {
             let box_variance_m2 = self.cameras[world.camera].ground_point(bounding_box)?.box_variance_m2;
             Some((self.placed(world, bounding_box)?, box_variance_m2, self.ground.map_sigma_m.powi(2)))
         });
         let located =
             Located { tracklets: &tracklets, detections: &points, fixes: &self.fixes, gnss: self.model.gnss };
-        match_located(self.scene, &located, self.settings, random)
+        match_located(self.scene, &located, settings, random)
     }
 
-    /// Trains on the sure pieces and matches by the model, in turn.
+    /// Trains on the probable carriers and matches by the model, in turn.
     fn trained(&self, world: &World, scores: WorldScores, random: &mut impl Rng) -> Result<JointMatch> {
-        let mut matching = self.matched(world, random)?;
-        let mut model = self.fit(&matching, |_| true)?;
-        let mut regressor = model.load()?;
+        let probable = &MatchSettings { min_probability: Some(TRAINING_PROBABILITY), ..self.settings };
+        let mut matching = self.matched(world, probable, random)?;
+        let mut regressor = self.fit(&matching, |_| true)?;
         for _ in 1..ROUNDS {
-            matching = match_scene(self.scene, &regressor, self.model.gnss, self.settings, random)?;
+            matching = match_scene(self.scene, &regressor, self.model.gnss, probable, random)?;
             let next = self.fit(&matching, |_| true)?;
-            let next_regressor = next.load()?;
-            let moved_m = self.distance_m(&regressor, &next_regressor);
-            (model, regressor) = (next, next_regressor);
+            let moved_m = self.distance_m(&regressor, &next);
+            regressor = next;
             if moved_m < STABLE * self.ground.map_sigma_m {
                 break;
             }
         }
-        matching = match_scene(self.scene, &regressor, self.model.gnss, self.settings, random)?;
+        matching = match_scene(self.scene, &regressor, self.model.gnss, probable, random)?;
         let halves_m = self.halves_distance_m(&matching)?;
         if let Some(halves_m) =
             halves_m.filter(|halves_m| *halves_m > MAX_HALVES_DISTANCE * self.ground.map_sigma_m)
@@ -322,14 +327,15 @@ impl<'a> JointSearch<'a> {
                 "record longer, with receivers carried across the whole view",
             ));
         }
-        let pieces = matching.sure(self.settings.min_probability).count();
-        if pieces < MIN_PIECES {
+        matching = match_scene(self.scene, &regressor, self.model.gnss, &self.settings, random)?;
+        let (pieces, groups) = (matching.sure().count(), matching.groups.len());
+        if GROUPS_FOR_A_PIECE * pieces + groups < GROUPS_FOR_A_PIECE * MIN_PIECES {
             return Err(not_identifiable(
-                &format!("only {pieces} tracklets have a sure receiver"),
-                "record longer, with receivers carried across the whole view",
+                &format!("only {pieces} tracklets and {groups} groups of them have a sure receiver"),
+                "record longer, with receivers carried across the whole view, best by people who walk alone",
             ));
         }
-        Ok(JointMatch { matching, model, scores })
+        Ok(JointMatch { matching, scores })
     }
 
     /// Mean distance between placed and regressed positions, m.
@@ -353,24 +359,24 @@ impl<'a> JointSearch<'a> {
     /// error of the model that is trained on all of them (delete-group jackknife with two groups). `None` with too few
     /// receivers.
     fn halves_distance_m(&self, matching: &Matching) -> Result<Option<f64>> {
-        let mut counts: BTreeMap<&ReceiverId, usize> = BTreeMap::new();
-        for piece in matching.sure(TRAINING_PROBABILITY) {
-            *counts.entry(&piece.receiver_id).or_default() += piece.detections.len();
+        let mut counts: BTreeMap<TargetId, usize> = BTreeMap::new();
+        for own in matching.carrier_boxes(self.scene.detections) {
+            *counts.entry(own.detection.target_id).or_default() += 1;
         }
         if counts.len() < MIN_HALVED_RECEIVERS {
             return Ok(None);
         }
-        let mut by_count: Vec<(&ReceiverId, usize)> = counts.into_iter().collect();
+        let mut by_count: Vec<(TargetId, usize)> = counts.into_iter().collect();
         by_count.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
         // In turn, so that both halves have as many boxes: 0 1 1 0 0 1 1 0.
         let half_of =
-            |id: &ReceiverId| by_count.iter().position(|own| own.0 == id).map(|at| at.div_ceil(2) % 2);
+            |id: &TargetId| by_count.iter().position(|own| own.0 == *id).map(|at| at.div_ceil(2) % 2);
         let [one, other] = [0, 1].map(|half| self.fit(matching, |id| half_of(id) == Some(half)));
-        Ok(Some(self.distance_m(&one?.load()?, &other?.load()?)))
+        Ok(Some(self.distance_m(&one?, &other?)))
     }
 
     /// Trains on the carriers of some of the receivers.
-    fn fit(&self, matching: &Matching, is_used: impl Fn(&ReceiverId) -> bool) -> Result<Artifact> {
+    fn fit(&self, matching: &Matching, is_used: impl Fn(&TargetId) -> bool) -> Result<Regressor> {
         let (samples, unpaired) = training_samples(self.scene, matching, is_used);
         let options = FitOptions {
             recipe: Recipe::GaussianProcess,
@@ -387,13 +393,14 @@ impl<'a> JointSearch<'a> {
         };
         let fitted = fit(input, &options, &mut observer);
         cancellation.check()?;
-        fitted.map_err(|error| {
+        let fitted = fitted.map_err(|error| {
             // Boxes of wrong carriers may have no fit at all, which is no fault of the program.
             not_identifiable(
                 &format!("the matched boxes cannot train a model: {error}"),
                 "record longer, with receivers carried across the whole view",
             )
-        })
+        })?;
+        fitted.load()
     }
 }
 
@@ -467,25 +474,23 @@ pub fn joint_pairing() -> PairingSettings {
     }
 }
 
-/// Samples of the sure boxes, under their receivers' ids, and all other boxes.
+/// Samples of the boxes of some receivers' carriers, under the receivers' ids, and all other boxes.
 fn training_samples(
     scene: &Scene<'_>,
     matching: &Matching,
-    is_used: impl Fn(&ReceiverId) -> bool,
+    is_used: impl Fn(&TargetId) -> bool,
 ) -> (Vec<Sample>, Vec<Detection>) {
-    let detections = scene.detections;
-    let mut is_sure = vec![false; detections.len()];
-    let mut sure = Vec::new();
-    for piece in matching.sure(TRAINING_PROBABILITY).filter(|piece| is_used(&piece.receiver_id)) {
-        for at in &piece.detections {
-            is_sure[*at] = true;
-            let target_id = TargetId::from(piece.receiver_id.clone());
-            sure.push(Detection { target_id, ..detections[*at].clone() });
+    let mut is_used_box = vec![false; scene.detections.len()];
+    let mut used = Vec::new();
+    for CarrierBox { detection, at, .. } in matching.carrier_boxes(scene.detections) {
+        if is_used(&detection.target_id) {
+            at.into_iter().for_each(|at| is_used_box[at] = true);
+            used.push(detection);
         }
     }
     let receivers = matching.receivers_of(scene.received, scene.receivers);
-    let samples = pair(sure, scene.received.to_vec(), &receivers, &joint_pairing()).samples;
-    let others = detections.iter().zip(&is_sure).filter(|(_, is_sure)| !**is_sure);
+    let samples = pair(used, scene.received.to_vec(), &receivers, &joint_pairing()).samples;
+    let others = scene.detections.iter().zip(&is_used_box).filter(|(_, is_used)| !**is_used);
     (samples, others.map(|(own, _)| own.clone()).collect())
 }
 

@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::matching::{MatchedPiece, Matching};
+use super::carriers::{MatchedPiece, Matching};
 use super::recording::TRACKLET_GAP_S;
 use crate::domain::{Detection, ReceivedFix, ReceiverId, ReceiverMatch, TargetId};
 

@@ -1,11 +1,10 @@
 //! Boxes matched with receivers where a model regresses positions.
 
-use std::collections::BTreeSet;
-
 use rand::Rng;
 
 use super::assignment::posterior;
 use super::cancellation::Cancellation;
+use super::carriers::{MatchedGroup, MatchedPiece, Matching};
 use super::chains::{Chain, ChainSettings, Piece, PieceTable};
 use super::companions::View;
 use super::company::Company;
@@ -15,8 +14,7 @@ use super::groups::{Candidate, Together, groups};
 use super::recording::Scene;
 use super::tracklet::{SceneMotion, TimedFix, Tracklet};
 use crate::domain::{
-    ClockOffset, Detection, Error, ErrorKind, GaussMarkovNoise, ReceivedFix, Receiver, ReceiverId, Receivers,
-    Result, TargetId,
+    ClockOffset, Detection, Error, ErrorKind, GaussMarkovNoise, ReceivedFix, Receivers, Result,
 };
 use crate::model::Regressor;
 
@@ -24,6 +22,8 @@ use crate::model::Regressor;
 const OFFSET_STEP_S: f64 = 0.5;
 /// Posterior probabilities below it are not reported.
 const LEAST_PROBABILITY: f64 = 0.01;
+/// Posterior probability from which on pieces are sure where nothing else is asked for.
+const MIN_PROBABILITY: f64 = 0.9;
 /// White error per axis that every receiver has at least, m: differences of its fixes are not trusted
 /// further.
 pub(super) const LEAST_WHITE_SIGMA_M: f64 = 0.5;
@@ -31,8 +31,9 @@ pub(super) const LEAST_WHITE_SIGMA_M: f64 = 0.5;
 /// How tracklets are matched with receivers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MatchSettings {
-    /// Posterior probability from which on a box counts as the receiver's.
-    pub min_probability: f64,
+    /// Posterior probability from which on a box counts as the receiver's, 0.5 to 1; `None` for 0.9 by a known model, and
+    /// 0.8 without one.
+    pub min_probability: Option<f64>,
     /// A receiver's clock is off by at most this, s; 0 for clocks that are exact.
     pub clock_window_s: f64,
     /// Error of the receivers; `None` for what the model states, else that of a phone.
@@ -63,8 +64,8 @@ impl Default for MatchLimits {
 impl MatchSettings {
     /// # Errors
     /// Names `min_probability` unless it is from 0.5 to 1, and `clock_window_s` unless it is from 0 to 30 s.
-    pub fn new(min_probability: f64, clock_window_s: f64, limits: MatchLimits) -> Result<Self> {
-        if !(0.5..=1.0).contains(&min_probability) {
+    pub fn new(min_probability: Option<f64>, clock_window_s: f64, limits: MatchLimits) -> Result<Self> {
+        if min_probability.is_some_and(|given| !(0.5..=1.0).contains(&given)) {
             return Err(Error::invalid("min_probability", "must be a number from 0.5 to 1"));
         }
         if !(0.0..=30.0).contains(&clock_window_s) {
@@ -77,87 +78,12 @@ impl MatchSettings {
 impl Default for MatchSettings {
     fn default() -> Self {
         Self {
-            min_probability: 0.9,
+            min_probability: None,
             clock_window_s: 0.0,
             gnss: None,
             chains: ChainSettings::default(),
             limits: MatchLimits::default(),
         }
-    }
-}
-
-/// A part of a tracklet and the receiver that its target carries most probably.
-#[derive(Debug, Clone, PartialEq)]
-pub struct MatchedPiece {
-    /// Id that the tracker gave it.
-    pub tracker_id: TargetId,
-    /// Indices of its detections, in order of time.
-    pub detections: Vec<usize>,
-    /// The receiver.
-    pub receiver_id: ReceiverId,
-    /// Posterior probability.
-    pub probability: f64,
-}
-
-/// The tracklets of which one shows the carrier of a receiver while all of them are seen.
-#[derive(Debug, Clone, PartialEq)]
-pub struct MatchedGroup {
-    /// The members with their boxes of that time, the most probable first; all have the same receiver.
-    pub members: Vec<MatchedPiece>,
-}
-
-impl MatchedGroup {
-    /// Posterior probability that one of the members shows the carrier.
-    #[must_use]
-    pub fn probability(&self) -> f64 {
-        self.members.iter().map(|member| member.probability).sum()
-    }
-
-    /// The receiver of all members.
-    #[must_use]
-    pub fn receiver_id(&self) -> &ReceiverId {
-        &self.members[0].receiver_id
-    }
-}
-
-/// Which boxes show the carriers of which receivers.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Matching {
-    /// Pieces of tracklets with their most probable receivers, in order of tracker's id and time.
-    pub pieces: Vec<MatchedPiece>,
-    /// Tracklets that share a receiver, none of them sure, in order of receiver and time.
-    pub groups: Vec<MatchedGroup>,
-    /// Clock offsets found, beside those that were given.
-    pub clock_offsets: Vec<(ReceiverId, ClockOffset)>,
-    /// Tracklets and receivers that were compared.
-    pub tracklets: usize,
-    /// Receivers with fixes.
-    pub receivers: usize,
-    /// Cuts within tracklets where the tracker's id may have moved to another target.
-    pub cuts: usize,
-}
-
-impl Matching {
-    /// The receivers of fixes under their own ids, their given clock offsets corrected by those found.
-    #[must_use]
-    pub fn receivers_of(&self, fixes: &[ReceivedFix], given: &Receivers) -> Receivers {
-        let ids: BTreeSet<&ReceiverId> = fixes.iter().filter_map(|fix| fix.receiver_id.as_ref()).collect();
-        let receivers = ids.into_iter().map(|id| {
-            let known = given.get(id);
-            let given_s = known.map_or(0.0, |own| own.clock_offset.seconds());
-            let found = self.clock_offsets.iter().find(|(own, _)| own == id);
-            let found_s = found.map_or(0.0, |(_, own)| own.seconds());
-            let clock_offset = ClockOffset::from_seconds(given_s + found_s).unwrap_or(ClockOffset::ZERO);
-            let sigma = known.and_then(|own| own.sigma);
-            Receiver { clock_offset, sigma, ..Receiver::named(id.clone()) }
-        });
-        // The bound on receivers is smaller than that of a list of receivers.
-        Receivers::new(receivers).unwrap_or_default()
-    }
-
-    /// Pieces from a posterior probability on.
-    pub fn sure(&self, min_probability: f64) -> impl Iterator<Item = &MatchedPiece> {
-        self.pieces.iter().filter(move |piece| piece.probability >= min_probability)
     }
 }
 
@@ -263,9 +189,11 @@ pub(super) fn match_located(
         own_probabilities: posterior.pieces.iter().map(own_probability).collect(),
         posterior,
     };
+    let min_probability = settings.min_probability.unwrap_or(MIN_PROBABILITY);
     let mut matching = Matching {
+        min_probability,
         pieces: shown.matched(),
-        groups: shown.groups(settings.min_probability),
+        groups: shown.groups(min_probability),
         tracklets: located.tracklets.len(),
         receivers: scene.receiver_ids.len(),
         cuts: shown.posterior.pieces.len().saturating_sub(located.tracklets.len()),

@@ -8,6 +8,7 @@
 mod assignment;
 mod axis_filter;
 mod cancellation;
+mod carriers;
 mod chains;
 mod companions;
 mod company;
@@ -26,12 +27,11 @@ mod tracklet;
 mod world_receivers;
 
 pub use self::cancellation::Cancellation;
+pub use self::carriers::{CarrierBox, MatchedGroup, MatchedPiece, Matching};
 pub use self::chains::ChainSettings;
 pub use self::joint::{JointMatch, WorldScores, joint_pairing, match_without_model};
 pub use self::live::{LiveMatchSettings, LiveMatches, LiveWindow};
-pub use self::matching::{
-    MatchLimits, MatchSettings, MatchedGroup, MatchedPiece, Matching, match_with_model,
-};
+pub use self::matching::{MatchLimits, MatchSettings, match_with_model};
 pub use self::receiver_clocks::ReceiverClocks;
 pub use self::world_receivers::{MatchedReceivers, WorldReceiverWindow, WorldReceivers};
 

@@ -12,6 +12,7 @@ use super::statuses::to_status;
 use crate::admission::Lease;
 use crate::app::{LossReason, LostSiteEvents, SiteEventKind, SiteEvents, StoredSiteEvent, WorldTrackPoint};
 use crate::domain::{CameraId, Error, ErrorKind, ReceiverId, SiteId};
+use crate::fusion::clock_drift::ClockDrift;
 use crate::fusion::clock_estimate::ClockEstimate;
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
@@ -122,6 +123,12 @@ impl From<LostSiteEvents> for proto::WatchTracksResponse {
     }
 }
 
+impl From<ClockDrift> for proto::ClockDrift {
+    fn from(drift: ClockDrift) -> Self {
+        Self { ppm: drift.ppm, sigma_ppm: drift.sigma_ppm }
+    }
+}
+
 impl From<(&CameraId, &ClockEstimate)> for proto::CameraClock {
     fn from((camera, clock): (&CameraId, &ClockEstimate)) -> Self {
         Self {
@@ -129,6 +136,7 @@ impl From<(&CameraId, &ClockEstimate)> for proto::CameraClock {
             offset_s: clock.offset_s,
             sigma_s: clock.sigma_s,
             is_wrong: clock.is_wrong(),
+            drift: clock.drift.map(Into::into),
         }
     }
 }
@@ -140,6 +148,7 @@ impl From<(&ReceiverId, &ClockEstimate)> for proto::ReceiverClock {
             offset_s: clock.offset_s,
             sigma_s: clock.sigma_s,
             is_wrong: clock.is_wrong(),
+            drift: clock.drift.map(Into::into),
         }
     }
 }

@@ -2,6 +2,8 @@
 
 use jiff::{SignedDuration, Timestamp};
 
+use crate::clock_drift::ClockDrift;
+
 /// An offset is wrong, and corrected, beyond this one, s, and that many standard deviations.
 const LEAST_WRONG_S: f64 = 0.2;
 const SIGNIFICANT: f64 = 4.0;
@@ -13,6 +15,8 @@ pub struct ClockEstimate {
     pub offset_s: f64,
     /// Standard deviation of the estimate, s.
     pub sigma_s: f64,
+    /// How the offset changes, where it was followed for an hour.
+    pub drift: Option<ClockDrift>,
 }
 
 impl ClockEstimate {

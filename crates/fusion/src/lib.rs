@@ -23,6 +23,7 @@
 #![warn(clippy::expect_used, clippy::panic, clippy::unreachable)]
 
 pub mod association;
+pub mod clock_drift;
 pub mod clock_estimate;
 pub mod clock_offset;
 pub mod drift_detector;

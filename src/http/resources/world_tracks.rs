@@ -19,6 +19,7 @@ use super::tracks::{KEEP_ALIVE, PointGeometry, ReceiverMatch, event_of};
 use crate::app::{LostSiteEvents, SiteEventKind, SiteTracks, StoredSiteEvent, WorldTrackPoint};
 use crate::domain::{CameraId, Error, LiveId, ReceiverId, Result, TargetId};
 use crate::exchange::wire::{Motion, PlaneCovariance, Position};
+use crate::fusion::clock_drift;
 use crate::fusion::clock_estimate::ClockEstimate;
 use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::extract::{Client, Params, SitePath, WorldTrackPath, negotiate};
@@ -125,6 +126,21 @@ impl From<&WorldTrackPoint> for WorldTrack {
     }
 }
 
+/// How fast a clock is, by a line through its offsets of up to a day; 10 millionths are 0.9 s a day.
+#[derive(Serialize, ToSchema)]
+struct ClockDrift {
+    /// Millionths by which its seconds are too short; negative where it is slow.
+    ppm: f64,
+    /// Standard deviation of the estimate, millionths.
+    sigma_ppm: f64,
+}
+
+impl From<clock_drift::ClockDrift> for ClockDrift {
+    fn from(drift: clock_drift::ClockDrift) -> Self {
+        Self { ppm: drift.ppm, sigma_ppm: drift.sigma_ppm }
+    }
+}
+
 /// How late the times of a camera are beside those of most cameras of its site.
 #[derive(Serialize, ToSchema)]
 struct CameraClock {
@@ -137,6 +153,8 @@ struct CameraClock {
     /// True if the offset is neither chance nor a difference of two maps: world tracks correct the camera's times by it, and its
     /// clock should be set.
     is_wrong: bool,
+    /// How fast the clock is, where its offset was followed for an hour.
+    drift: Option<ClockDrift>,
 }
 
 impl From<(&CameraId, &ClockEstimate)> for CameraClock {
@@ -146,6 +164,7 @@ impl From<(&CameraId, &ClockEstimate)> for CameraClock {
             offset_s: clock.offset_s,
             sigma_s: clock.sigma_s,
             is_wrong: clock.is_wrong(),
+            drift: clock.drift.map(Into::into),
         }
     }
 }
@@ -163,6 +182,8 @@ struct ReceiverClock {
     /// True if the offset is no chance: world tracks correct the receiver's times by it. Where `common_receiver_clock` is wrong as
     /// well, the cameras' clocks should be set; else subtract it from the receiver's `clock_offset_s`.
     is_wrong: bool,
+    /// How fast the clock is, where its offset was followed for an hour.
+    drift: Option<ClockDrift>,
 }
 
 impl From<(&ReceiverId, &ClockEstimate)> for ReceiverClock {
@@ -172,6 +193,7 @@ impl From<(&ReceiverId, &ClockEstimate)> for ReceiverClock {
             offset_s: clock.offset_s,
             sigma_s: clock.sigma_s,
             is_wrong: clock.is_wrong(),
+            drift: clock.drift.map(Into::into),
         }
     }
 }

@@ -91,7 +91,7 @@ fn common(by_receiver: &BTreeMap<ReceiverId, ClockEstimate>) -> Option<ClockEsti
 /// The mean of receivers' offsets by weights of Huber.
 fn robust_mean(receivers: &[ClockEstimate]) -> ClockEstimate {
     let variance_s2 = |own: &ClockEstimate| own.sigma_s.powi(2) + BETWEEN_S.powi(2);
-    let mut mean = ClockEstimate { offset_s: 0.0, sigma_s: f64::INFINITY };
+    let mut mean = ClockEstimate { offset_s: 0.0, sigma_s: f64::INFINITY, drift: None };
     for round in 0..ROUNDS {
         let (mut weights, mut sum) = (0.0, 0.0);
         for own in receivers {
@@ -101,7 +101,7 @@ fn robust_mean(receivers: &[ClockEstimate]) -> ClockEstimate {
             sum += weight * own.offset_s;
         }
         let variance_s2 = weights.recip() + DELAY_S.powi(2);
-        mean = ClockEstimate { offset_s: sum / weights, sigma_s: variance_s2.sqrt() };
+        mean = ClockEstimate { offset_s: sum / weights, sigma_s: variance_s2.sqrt(), drift: None };
     }
     mean
 }
@@ -139,7 +139,7 @@ impl CarriedFixes<'_> {
         }
         let left = (sums.dd - sums.vd * sums.vd / precision).max(0.0);
         let scale = (FREEDOM + left) / (FREEDOM + 2.0 * sums.fixes as f64);
-        Some(ClockEstimate { offset_s, sigma_s: (scale.max(1.0) / precision).sqrt() })
+        Some(ClockEstimate { offset_s, sigma_s: (scale.max(1.0) / precision).sqrt(), drift: None })
     }
 
     /// The sums about an offset.

@@ -98,7 +98,7 @@ fn solved(overlaps: &BTreeMap<CameraPair, Overlap>) -> BTreeMap<CameraId, ClockE
         let offset_s = offsets_s[camera] - offsets_s[median];
         let variance_s2 =
             covariance[(camera, camera)] + covariance[(median, median)] - 2.0 * covariance[(camera, median)];
-        ClockEstimate { offset_s, sigma_s: (inflation * variance_s2.max(0.0)).sqrt() }
+        ClockEstimate { offset_s, sigma_s: (inflation * variance_s2.max(0.0)).sqrt(), drift: None }
     };
     cameras.iter().map(|camera| (*camera).clone()).zip((0..count).map(clock)).collect()
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::clocks::SiteClocks;
+use super::clocks::{ClockHistories, SiteClocks};
 use super::events::{SiteEvent, SiteEventKind};
 use super::item::{ItemSource, SiteItem};
 use super::places::SitePlaces;
@@ -71,6 +71,8 @@ pub(super) struct SiteTracker {
     history: HistoryQueue,
     /// Cameras that were moved, as far as nobody has taken them.
     findings: Vec<Finding>,
+    /// A clock is the same when the tracker starts again.
+    clock_histories: ClockHistories,
 }
 
 /// The model by which a camera's boxes were located.
@@ -138,6 +140,7 @@ impl SiteTracker {
             recorders: HashMap::new(),
             history,
             findings: Vec::new(),
+            clock_histories: ClockHistories::default(),
         }
     }
 
@@ -243,7 +246,9 @@ impl SiteTracker {
             return;
         };
         active.window.accept(found);
-        let wrong = lock(&self.live.clocks).set_receivers(active.window.clocks().clone());
+        let mut clocks = active.window.clocks().clone();
+        self.clock_histories.note_receivers(active.latest, &mut clocks);
+        let wrong = lock(&self.live.clocks).set_receivers(clocks);
         self.metrics.clocks_wrong(wrong);
         let events = active.tracker.set_receiver_matches(active.window.receivers());
         self.announce(events);
@@ -367,7 +372,9 @@ impl SiteTracker {
         let outcome = active.tracker.observe(&CameraFrame { camera, time, detections });
         self.findings.extend(outcome.moved.as_ref().and_then(|moved| active.finding(moved)));
         if outcome.has_new_clocks {
-            let wrong = lock(&self.live.clocks).set_cameras(active.tracker.clocks().clone());
+            let mut clocks = active.tracker.clocks().clone();
+            self.clock_histories.note_cameras(time, &mut clocks);
+            let wrong = lock(&self.live.clocks).set_cameras(clocks);
             self.metrics.clocks_wrong(wrong);
         }
         active.window.observe(&active.tracker, &outcome);

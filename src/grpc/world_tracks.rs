@@ -12,8 +12,7 @@ use super::statuses::to_status;
 use crate::admission::Lease;
 use crate::app::{LossReason, LostSiteEvents, SiteEventKind, SiteEvents, StoredSiteEvent, WorldTrackPoint};
 use crate::domain::{CameraId, Error, ErrorKind, ReceiverId, SiteId};
-use crate::fusion::clock_drift::ClockDrift;
-use crate::fusion::clock_estimate::ClockEstimate;
+use crate::fusion::clock_estimate::{ClockDrift, ClockEstimate};
 use crate::shutdown::Shutdown;
 use crate::telemetry::RequestId;
 

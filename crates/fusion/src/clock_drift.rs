@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 
 use jiff::{SignedDuration, Timestamp};
 
-use crate::clock_estimate::ClockEstimate;
+use crate::clock_estimate::{ClockDrift, ClockEstimate};
 
 /// An estimate is noted so long after the one before: by then most observations of an offset are new.
 const EVERY: SignedDuration = SignedDuration::from_mins(10);
@@ -19,15 +19,6 @@ const LEAST: usize = 6;
 /// set.
 const SET_SIGMAS: f64 = 6.0;
 const SET_S: f64 = 0.2;
-
-/// How fast a clock is, in millionths: 10 are 0.9 s a day.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ClockDrift {
-    /// By how much its seconds are too short; negative where it is slow.
-    pub ppm: f64,
-    /// Standard deviation of the estimate.
-    pub sigma_ppm: f64,
-}
 
 /// The offsets of one clock over time.
 #[derive(Debug, Clone, Default)]

@@ -2,8 +2,6 @@
 
 use jiff::{SignedDuration, Timestamp};
 
-use crate::clock_drift::ClockDrift;
-
 /// An offset is wrong, and corrected, beyond this one, s, and that many standard deviations.
 const LEAST_WRONG_S: f64 = 0.2;
 const SIGNIFICANT: f64 = 4.0;
@@ -17,6 +15,15 @@ pub struct ClockEstimate {
     pub sigma_s: f64,
     /// How the offset changes, where it was followed for an hour.
     pub drift: Option<ClockDrift>,
+}
+
+/// How fast a clock is, in millionths: 10 are 0.9 s a day.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ClockDrift {
+    /// By how much its seconds are too short; negative where it is slow.
+    pub ppm: f64,
+    /// Standard deviation of the estimate.
+    pub sigma_ppm: f64,
 }
 
 impl ClockEstimate {

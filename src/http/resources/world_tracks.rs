@@ -19,8 +19,7 @@ use super::tracks::{KEEP_ALIVE, PointGeometry, ReceiverMatch, event_of};
 use crate::app::{LostSiteEvents, SiteEventKind, SiteTracks, StoredSiteEvent, WorldTrackPoint};
 use crate::domain::{CameraId, Error, LiveId, ReceiverId, Result, TargetId};
 use crate::exchange::wire::{Motion, PlaneCovariance, Position};
-use crate::fusion::clock_drift;
-use crate::fusion::clock_estimate::ClockEstimate;
+use crate::fusion::clock_estimate::{self, ClockEstimate};
 use crate::http::plumbing::access::CallerApp;
 use crate::http::plumbing::extract::{Client, Params, SitePath, WorldTrackPath, negotiate};
 use crate::http::plumbing::problem::{ApiResult, Problem};
@@ -135,8 +134,8 @@ struct ClockDrift {
     sigma_ppm: f64,
 }
 
-impl From<clock_drift::ClockDrift> for ClockDrift {
-    fn from(drift: clock_drift::ClockDrift) -> Self {
+impl From<clock_estimate::ClockDrift> for ClockDrift {
+    fn from(drift: clock_estimate::ClockDrift) -> Self {
         Self { ppm: drift.ppm, sigma_ppm: drift.sigma_ppm }
     }
 }

@@ -88,11 +88,17 @@ async fn learn_from(app: &App, camera: &ActiveCamera, shutdown: &Shutdown) -> Re
     Ok(format!("{outcome}; training run {}", run.id))
 }
 
-/// Samples of the boxes that have a sure receiver, all other boxes without a fix, and what was found in words.
+/// Samples of the boxes that have a probable receiver and of the mean boxes of groups, all other boxes without a fix, and what was found in
+/// words.
 fn matched_samples(recording: Recording, request: &MatchRequest<'_>) -> Result<(Vec<StoredSample>, String)> {
     // Fixes have the camera's time already.
     let matched = recording.matched(&Receivers::default(), request)?;
     let (boxes, pairs) = (matched.report.matched_detections, matched.report.pairs.len());
+    let groups = matched.report.groups.len();
+    let mean_boxes: u64 = matched.report.groups.iter().map(|group| group.detections).sum();
     let (paired, ..) = matched.recording.paired(&matched.receivers, &joint_pairing());
-    Ok((paired.into_samples(true), format!("{boxes} boxes of {pairs} tracklets have a sure receiver")))
+    let found = format!(
+        "{boxes} boxes of {pairs} tracklets, and {mean_boxes} mean boxes of {groups} groups, have a receiver"
+    );
+    Ok((paired.into_samples(true), found))
 }

@@ -103,7 +103,7 @@ impl From<app::Learning> for Learning {
 ///
 /// While `learn_automatically` of the profile is on and there is no model, boxes that have only a tracker's id are recorded
 /// with the fixes of receivers. They are matched once enough is recorded, and matched again with more where that shows
-/// nobody's receiver beyond doubt. Boxes with a sure receiver become samples, and a training run starts.
+/// nobody's receiver beyond doubt. Boxes with a probable receiver become samples, and a training run starts.
 #[utoipa::path(
     get, path = "/v1/cameras/{camera}/learning", tag = "cameras",
     params(("camera" = String, Path, description = "The camera's id")),

@@ -15,6 +15,8 @@ const EVERY: SignedDuration = SignedDuration::from_mins(10);
 const MOST: usize = 144;
 /// A line has at least so many estimates.
 const LEAST: usize = 6;
+/// Least standard deviation of an estimate, s. The camera that the others are compared with has none at that time.
+const LEAST_SIGMA_S: f64 = 0.005;
 /// Two estimates that differ by more than this many standard deviations, and by more than 0.2 s, are not of one line: the clock was
 /// set.
 const SET_SIGMAS: f64 = 6.0;
@@ -61,7 +63,8 @@ impl ClockHistory {
             .estimates
             .iter()
             .map(|(time, own)| {
-                [time.duration_since(*first).as_secs_f64(), own.offset_s, own.sigma_s.powi(-2)]
+                let weight = own.sigma_s.max(LEAST_SIGMA_S).powi(-2);
+                [time.duration_since(*first).as_secs_f64(), own.offset_s, weight]
             })
             .collect();
         let sum = |of: &dyn Fn(&[f64; 3]) -> f64| points.iter().map(|own| own[2] * of(own)).sum::<f64>();
